@@ -1,0 +1,340 @@
+//! Strict loading: nothing is believed before it was checked.
+
+use std::collections::BTreeMap;
+use std::path::{Component, Path, PathBuf};
+
+use super::manifest::{FORMAT, FileEntry, Manifest, PartEntry, PartName, TensorSpec};
+use super::{DType, GOLDEN_BYTES_MAX, MANIFEST_BYTES_MAX, MANIFEST_FILE, PART_BYTES_MAX};
+use crate::files::{FileError, read_capped, sha256_hex};
+use crate::onnx::{self, OnnxError};
+use crate::settings::{ModelKind, SettingsError};
+use crate::tensors::{Tensors, TensorsError};
+
+/// Largest file of initial states accepted, in bytes.
+const INITIAL_BYTES_MAX: u64 = 1 << 20;
+
+/// Why a bundle was refused.
+#[derive(Debug, thiserror::Error)]
+pub enum BundleError {
+    /// A file is missing, unreadable, too large or a link.
+    #[error("bundle: {0}")]
+    File(#[from] FileError),
+    /// The manifest is not TOML of the expected form.
+    #[error("bundle: {path}: {reason}")]
+    Manifest {
+        /// The manifest.
+        path: PathBuf,
+        /// What is wrong with it.
+        reason: String,
+    },
+    /// The bundle was written for another version.
+    #[error(
+        "bundle: format {found}, this program reads format {FORMAT}; export it again with the matching trainer"
+    )]
+    Format {
+        /// The format found.
+        found: u32,
+    },
+    /// The sizes do not fit together.
+    #[error("bundle: {0}")]
+    Settings(#[from] SettingsError),
+    /// A file name points out of the folder.
+    #[error("bundle: file name {name:?} is not a plain name inside the bundle")]
+    OutsidePath {
+        /// The name.
+        name: String,
+    },
+    /// A file is not the one that was exported.
+    #[error(
+        "bundle: {file}: {what} is {found}, the manifest says {expected}; copy or export the bundle again"
+    )]
+    Mismatch {
+        /// The file.
+        file: String,
+        /// `size` or `sha256`.
+        what: &'static str,
+        /// What it is.
+        found: String,
+        /// What it must be.
+        expected: String,
+    },
+    /// A part that every policy needs is not listed, or one is listed twice.
+    #[error("bundle: part {part} is {problem}")]
+    Part {
+        /// The part.
+        part: PartName,
+        /// `missing` or `listed twice`.
+        problem: &'static str,
+    },
+    /// A part is not the ONNX this runtime runs.
+    #[error("bundle: {part}: {source}")]
+    Onnx {
+        /// The part.
+        part: PartName,
+        /// What is wrong.
+        source: OnnxError,
+    },
+    /// A part's inputs or outputs are not those of the contract.
+    #[error("bundle: {part}: {role} are {found}, expected {expected}")]
+    Signature {
+        /// The part.
+        part: PartName,
+        /// `inputs` or `outputs`, of the manifest or of the graph.
+        role: &'static str,
+        /// What was found.
+        found: String,
+        /// What the contract says.
+        expected: String,
+    },
+    /// Initial states or golden values are unusable.
+    #[error("bundle: {file}: {source}")]
+    Tensors {
+        /// The file.
+        file: String,
+        /// What is wrong.
+        source: TensorsError,
+    },
+    /// A value is out of its range.
+    #[error("bundle: {0}")]
+    Invalid(String),
+}
+
+/// The state every episode starts from: `h_0 = tanh(w)`, `z_0` = mode of the prior at `h_0`, per branch.
+#[derive(Debug, Clone, PartialEq)]
+pub struct InitialState {
+    /// Robot: h, d long.
+    pub robot_h: Vec<f32>,
+    /// Robot: z, n class indices.
+    pub robot_z: Vec<i64>,
+    /// Environment: h, d long.
+    pub environment_h: Vec<f32>,
+    /// Environment: z, n class indices.
+    pub environment_z: Vec<i64>,
+}
+
+/// A bundle whose every file was checked and is in memory, so that what was checked is what runs.
+#[derive(Debug, Clone)]
+pub struct Bundle {
+    /// The folder it came from.
+    pub folder: PathBuf,
+    /// The manifest.
+    pub manifest: Manifest,
+    /// The ONNX files' bytes.
+    pub parts: BTreeMap<PartName, Vec<u8>>,
+    /// The initial state.
+    pub initial: InitialState,
+    /// Golden inputs and outputs, see [`super`].
+    pub golden: Tensors,
+}
+
+impl Bundle {
+    /// Reads and checks a bundle folder.
+    ///
+    /// # Errors
+    /// See [`BundleError`]; nothing of a refused bundle is kept.
+    pub fn open(folder: &Path) -> Result<Self, BundleError> {
+        let manifest = read_manifest(&folder.join(MANIFEST_FILE))?;
+        let mut parts = BTreeMap::new();
+        for entry in &manifest.parts {
+            let bytes = read_entry(folder, &entry.file_entry(), PART_BYTES_MAX)?;
+            check_graph(entry, &bytes)?;
+            parts.insert(entry.name, bytes);
+        }
+        let initial = read_tensors(folder, &manifest.initial, INITIAL_BYTES_MAX)
+            .and_then(|tensors| read_initial(&manifest, &tensors))?;
+        let golden = read_tensors(folder, &manifest.golden, GOLDEN_BYTES_MAX)?;
+        Ok(Self { folder: folder.to_path_buf(), manifest, parts, initial, golden })
+    }
+
+    /// The bytes of a part that the bundle may or may not have.
+    #[must_use]
+    pub fn part(&self, name: PartName) -> Option<&[u8]> {
+        self.parts.get(&name).map(Vec::as_slice)
+    }
+}
+
+impl PartEntry {
+    /// File, size and checksum.
+    #[must_use]
+    pub fn file_entry(&self) -> FileEntry {
+        FileEntry { file: self.file.clone(), bytes: self.bytes, sha256: self.sha256.clone() }
+    }
+}
+
+fn read_manifest(path: &Path) -> Result<Manifest, BundleError> {
+    let wrong = |reason: String| BundleError::Manifest { path: path.to_path_buf(), reason };
+    let bytes = read_capped(path, MANIFEST_BYTES_MAX)?;
+    let text = String::from_utf8(bytes).map_err(|error| wrong(error.to_string()))?;
+    // The version first: a later format may have other keys, and should be told apart from a damaged file.
+    #[derive(serde::Deserialize)]
+    struct Versioned {
+        format: u32,
+    }
+    let first_line = |error: toml::de::Error| wrong(error.to_string().trim().replace('\n', " "));
+    let Versioned { format } = toml::from_str(&text).map_err(first_line)?;
+    if format != FORMAT {
+        return Err(BundleError::Format { found: format });
+    }
+    let manifest: Manifest = toml::from_str(&text).map_err(first_line)?;
+    manifest.check()?;
+    Ok(manifest)
+}
+
+impl Manifest {
+    /// Checks everything that can be checked without reading another file.
+    ///
+    /// # Errors
+    /// See [`BundleError`].
+    pub fn check(&self) -> Result<(), BundleError> {
+        self.model.validate()?;
+        if self.model.kind != ModelKind::Rcwm {
+            return Err(BundleError::Invalid("model.kind: only rcwm bundles can be deployed so far".into()));
+        }
+        let control = &self.control;
+        if !(control.rate_hz > 0.0 && control.rate_hz <= 10_000.0) {
+            return Err(BundleError::Invalid(format!(
+                "control.rate_hz = {}, expected 0 to 10000",
+                control.rate_hz
+            )));
+        }
+        for (low, high) in control.action_low.iter().zip(&control.action_high) {
+            // Written so that NaN fails.
+            if !(low.is_finite() && high.is_finite() && low < high) {
+                return Err(BundleError::Invalid(format!(
+                    "control: action limits {low} to {high}, expected low < high"
+                )));
+            }
+        }
+        for part in PartName::REQUIRED {
+            if !self.parts.iter().any(|entry| entry.name == part) {
+                return Err(BundleError::Part { part, problem: "missing" });
+            }
+        }
+        for (index, entry) in self.parts.iter().enumerate() {
+            if self.parts[..index].iter().any(|before| before.name == entry.name) {
+                return Err(BundleError::Part { part: entry.name, problem: "listed twice" });
+            }
+            let (inputs, outputs) = entry.name.signature(&self.model);
+            expect_specs(entry.name, "the manifest's inputs", &entry.inputs, &inputs)?;
+            expect_specs(entry.name, "the manifest's outputs", &entry.outputs, &outputs)?;
+        }
+        Ok(())
+    }
+}
+
+fn expect_specs(
+    part: PartName,
+    role: &'static str,
+    found: &[TensorSpec],
+    expected: &[TensorSpec],
+) -> Result<(), BundleError> {
+    if found == expected {
+        return Ok(());
+    }
+    let list = |specs: &[TensorSpec]| {
+        let each = specs.iter().map(|spec| format!("{} {:?} {:?}", spec.name, spec.dtype, spec.shape));
+        each.collect::<Vec<_>>().join(", ")
+    };
+    Err(BundleError::Signature { part, role, found: list(found), expected: list(expected) })
+}
+
+fn read_entry(folder: &Path, entry: &FileEntry, bytes_max: u64) -> Result<Vec<u8>, BundleError> {
+    let mut components = Path::new(&entry.file).components();
+    let plain = matches!((components.next(), components.next()), (Some(Component::Normal(_)), None));
+    if !plain || entry.file.contains(['\\', '\0', '/']) {
+        return Err(BundleError::OutsidePath { name: entry.file.clone() });
+    }
+    let bytes = read_capped(&folder.join(&entry.file), bytes_max)?;
+    let mismatch = |what, found: String, expected: String| {
+        Err(BundleError::Mismatch { file: entry.file.clone(), what, found, expected })
+    };
+    if bytes.len() as u64 != entry.bytes {
+        return mismatch("size", bytes.len().to_string(), entry.bytes.to_string());
+    }
+    let sha256 = sha256_hex(&bytes);
+    if sha256 != entry.sha256 {
+        return mismatch("sha256", sha256, entry.sha256.clone());
+    }
+    Ok(bytes)
+}
+
+fn check_graph(entry: &PartEntry, bytes: &[u8]) -> Result<(), BundleError> {
+    let part = entry.name;
+    let model = onnx::parse_self_contained(bytes).map_err(|source| BundleError::Onnx { part, source })?;
+    let graph = model.graph.ok_or(BundleError::Onnx { part, source: OnnxError::NoGraph })?;
+    let specs = |values: &[onnx::ValueInfo]| -> Option<Vec<TensorSpec>> {
+        values
+            .iter()
+            .map(|value| {
+                let (elem_type, shape) = value.fixed()?;
+                Some(TensorSpec { name: value.name.clone(), dtype: DType::from_onnx(elem_type)?, shape })
+            })
+            .collect()
+    };
+    for (role, values, expected) in [
+        ("the graph's inputs", &graph.input, &entry.inputs),
+        ("the graph's outputs", &graph.output, &entry.outputs),
+    ] {
+        expect_specs(part, role, &specs(values).unwrap_or_default(), expected)?;
+    }
+    Ok(())
+}
+
+impl DType {
+    /// The ONNX number of this type.
+    #[must_use]
+    pub const fn to_onnx(self) -> i32 {
+        match self {
+            Self::U8 => onnx::data_type::UINT8,
+            Self::I64 => onnx::data_type::INT64,
+            Self::F32 => onnx::data_type::FLOAT,
+        }
+    }
+
+    /// The type of an ONNX number, if it is one that crosses a part's border.
+    #[must_use]
+    pub const fn from_onnx(number: i32) -> Option<Self> {
+        match number {
+            onnx::data_type::UINT8 => Some(Self::U8),
+            onnx::data_type::INT64 => Some(Self::I64),
+            onnx::data_type::FLOAT => Some(Self::F32),
+            _ => None,
+        }
+    }
+}
+
+fn read_tensors(folder: &Path, entry: &FileEntry, bytes_max: u64) -> Result<Tensors, BundleError> {
+    let bytes = read_entry(folder, entry, bytes_max)?;
+    Tensors::from_bytes(&bytes).map_err(|source| BundleError::Tensors { file: entry.file.clone(), source })
+}
+
+fn read_initial(manifest: &Manifest, tensors: &Tensors) -> Result<InitialState, BundleError> {
+    let model = &manifest.model;
+    let file = &manifest.initial.file;
+    let wrong = |source| BundleError::Tensors { file: file.clone(), source };
+    let h = |name: &str| -> Result<Vec<f32>, BundleError> {
+        let array = tensors.f32(name).map_err(wrong)?;
+        if array.shape() != [1, model.deter] || array.iter().any(|x| !x.is_finite()) {
+            let found = format!("{:?}", array.shape());
+            let expected = format!("finite, [1, {}]", model.deter);
+            return Err(wrong(TensorsError::Unexpected { name: name.to_owned(), found, expected }));
+        }
+        Ok(array.iter().copied().collect())
+    };
+    let z = |name: &str| -> Result<Vec<i64>, BundleError> {
+        let array = tensors.i64(name).map_err(wrong)?;
+        let classes = 0..model.classes as i64;
+        if array.shape() != [1, model.categoricals] || array.iter().any(|class| !classes.contains(class)) {
+            let found = format!("{:?}", array.shape());
+            let expected = format!("[1, {}] of classes 0 to {}", model.categoricals, model.classes - 1);
+            return Err(wrong(TensorsError::Unexpected { name: name.to_owned(), found, expected }));
+        }
+        Ok(array.iter().copied().collect())
+    };
+    Ok(InitialState {
+        robot_h: h("robot/h")?,
+        robot_z: z("robot/z")?,
+        environment_h: h("environment/h")?,
+        environment_z: z("environment/z")?,
+    })
+}

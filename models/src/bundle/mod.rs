@@ -1,0 +1,35 @@
+//! The folder a trainer exports and a runtime deploys.
+//!
+//! ```text
+//! manifest.toml        what follows, with sizes and checksums
+//! encoder.onnx ...     one self-contained ONNX file a part
+//! initial.safetensors  the learned initial state of each branch: `robot/h` [1, d] f32, `robot/z` [1, n] i64, `environment/...`
+//! golden.safetensors   ticks of inputs and the outputs the trainer computed for them
+//! ```
+//!
+//! **Golden tensors.** The first dimension counts ticks. Inputs: `input/image` u8 [K, 64, 64, 3], `input/action` f32 [K, 4]
+//! (as executed to get there), `input/is_first` u8 [K], `input/robot_noise` and `input/environment_noise` f32
+//! [K, 2, n, m] (first the prior's, then the posterior's). Outputs: `expect/<part>/<output>` with the shapes of
+//! [`PartName::signature`], their leading 1 replaced by the number of ticks. Large ones (`features`, images) may cover
+//! only the first ticks. The state that enters tick t is the initial one where `is_first`, else the posterior of
+//! tick t-1.
+//!
+//! A bundle comes from outside: nothing in it is believed before [`Bundle::open`] has checked version, sizes, names, paths and
+//! checksums, and that no ONNX file refers to data outside itself.
+
+mod load;
+mod manifest;
+
+pub use load::{Bundle, BundleError, InitialState};
+pub use manifest::{
+    Control, DType, FORMAT, FileEntry, Manifest, PartEntry, PartName, Provenance, TensorSpec,
+};
+
+/// File name of the manifest.
+pub const MANIFEST_FILE: &str = "manifest.toml";
+/// Largest manifest accepted, in bytes.
+pub const MANIFEST_BYTES_MAX: u64 = 1 << 20;
+/// Largest part accepted, in bytes; the paper's largest is about 25 MB.
+pub const PART_BYTES_MAX: u64 = 256 << 20;
+/// Largest golden file accepted, in bytes.
+pub const GOLDEN_BYTES_MAX: u64 = 64 << 20;

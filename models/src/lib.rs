@@ -1,0 +1,36 @@
+//! The contract between simulator, trainer and runtime.
+//!
+//! | module | holds |
+//! | --- | --- |
+//! | [`settings`] | the sizes of a model, presets `debug`, `small`, `paper`, TOML and dotted overrides |
+//! | [`tasks`] | Meta-World's task names and their numbers on the wire |
+//! | [`wire`] | the messages between simulator and controller and the shared-memory link that carries them |
+//! | [`bundle`] | the folder a trainer exports and a runtime deploys |
+//! | [`onnx`] | reading and writing ONNX files |
+//! | [`episode`] | recorded episodes as Dreamer's `.npz` files |
+//! | [`tensors`] | named arrays in safetensors files |
+//! | [`files`] | atomic writes, checksums, capped reads |
+//!
+//! This crate never depends on candle, tract or pyo3.
+
+pub mod bundle;
+pub mod episode;
+pub mod files;
+pub mod onnx;
+pub mod settings;
+pub mod tasks;
+pub mod tensors;
+pub mod wire;
+
+/// Side of the square images on the wire and into the encoder, in pixels.
+pub const IMAGE_SIDE: usize = 64;
+/// Colour channels of an image.
+pub const IMAGE_CHANNELS: usize = 3;
+/// Bytes of one image, rows first, channels last.
+pub const IMAGE_BYTES: usize = IMAGE_SIDE * IMAGE_SIDE * IMAGE_CHANNELS;
+/// Bytes of one robot mask (0 or 255 per pixel).
+pub const MASK_BYTES: usize = IMAGE_SIDE * IMAGE_SIDE;
+/// Length of an action: three translations of the hand and the gripper, each in [-1, 1].
+pub const ACTION_LEN: usize = 4;
+/// Length of the proprioception vector: 9 joint positions, then 9 joint velocities.
+pub const PROPRIOCEPTION_LEN: usize = 18;

@@ -1,0 +1,26 @@
+//! What travels between a simulator (or a robot) and a controller, and the shared-memory link that carries it.
+//!
+//! Two publish-subscribe services per instance, `rcwm/<instance>/observation` and `rcwm/<instance>/action`, each with an
+//! event service of the same name that wakes the other side. One observation is about 16.5 kB and is written in place.
+//!
+//! A conversation of two ticks in lock-step:
+//!
+//! ```text
+//! controller                                   simulator
+//!   connect, hello            ------------->     publishes what it last observed
+//!   <-- Observation { sequence: 0, FIRST }       waits
+//!   Action { answers: 0 }     ------------->     steps with it
+//!   <-- Observation { sequence: 1, executed_action: ... }
+//! ```
+//!
+//! The observation alone is a complete transition in Dreamer's convention: `executed_action` led to `image`.
+
+pub mod clock;
+mod link;
+mod messages;
+
+pub use link::{
+    ControllerLink, Events, LinkError, LinkSettings, ObservationSample, ObservationSlot, SimulatorLink, Wait,
+    list_leftovers,
+};
+pub use messages::{Action, ActionSource, Observation, ObservationFlags};
