@@ -130,13 +130,13 @@ impl ModelSettings {
             let found = self.action;
             return Err(SettingsError::Invalid(format!("action = {found}, the wire carries {ACTION_LEN}")));
         }
-        if self.bins % 2 == 0 {
+        if self.bins.is_multiple_of(2) {
             let found = self.bins;
             return Err(SettingsError::Invalid(format!(
                 "bins = {found}, expected an odd number (one bin is 0)"
             )));
         }
-        if self.kind == ModelKind::Rcwm && self.deter % self.classes != 0 {
+        if self.kind == ModelKind::Rcwm && !self.deter.is_multiple_of(self.classes) {
             return Err(SettingsError::Invalid(format!(
                 "deter = {} is not a multiple of classes = {}, which the interaction model needs (k = d / m)",
                 self.deter, self.classes

@@ -20,6 +20,7 @@ use iceoryx2::service::port_factory::{event, publish_subscribe};
 use super::{Action, Observation};
 
 type Ipc = ipc::Service;
+type Received<T> = Sample<Ipc, T, ()>;
 
 /// Recorders and other listeners beside the controller.
 const SUBSCRIBERS_MAX: usize = 8;
@@ -31,7 +32,7 @@ const EVENT_HELLO: usize = 1;
 const EVENT_CLOSED: usize = 2;
 
 /// An observation received in shared memory; it stays valid while this is held.
-pub type ObservationSample = Sample<Ipc, Observation, ()>;
+pub type ObservationSample = Received<Observation>;
 
 /// Which link, and how to wait on it.
 #[derive(Debug, Clone)]
@@ -221,7 +222,7 @@ struct Receiver<T: ZeroCopySend + std::fmt::Debug + 'static> {
 }
 
 impl<T: ZeroCopySend + std::fmt::Debug + 'static> Receiver<T> {
-    fn poll(&self) -> Result<Option<Sample<Ipc, T, ()>>, LinkError> {
+    fn poll(&self) -> Result<Option<Received<T>>, LinkError> {
         self.subscriber.receive().map_err(traffic("receiving"))
     }
 
@@ -232,11 +233,7 @@ impl<T: ZeroCopySend + std::fmt::Debug + 'static> Receiver<T> {
         Ok(events)
     }
 
-    fn wait(
-        &self,
-        spin: Duration,
-        timeout: Duration,
-    ) -> Result<(Wait<Sample<Ipc, T, ()>>, Events), LinkError> {
+    fn wait(&self, spin: Duration, timeout: Duration) -> Result<(Wait<Received<T>>, Events), LinkError> {
         let start = Instant::now();
         while start.elapsed() < spin.min(timeout) {
             if let Some(sample) = self.poll()? {
@@ -524,4 +521,89 @@ pub fn list_leftovers(prefix: &str) -> Result<Vec<String>, LinkError> {
         );
     }
     Ok(left)
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn settings(name: &str) -> LinkSettings {
+        let prefix = Some(format!("rcwm_unit_{}_{name}_", std::process::id()));
+        LinkSettings { instance: name.to_owned(), prefix, spin: Duration::ZERO }
+    }
+
+    const SOON: Duration = Duration::from_secs(5);
+
+    #[test]
+    fn an_observation_goes_over_and_its_answer_comes_back() {
+        let settings = settings("both_ways");
+        let simulator = SimulatorLink::open(settings.clone()).unwrap();
+        let controller = ControllerLink::open(settings.clone()).unwrap();
+        assert!(simulator.poll_events().unwrap().hello, "a new controller announces itself");
+        simulator.publish(|observation| observation.sequence = 7).unwrap();
+        let Wait::Message(observation) = controller.wait_observation(SOON).unwrap() else {
+            panic!("no observation")
+        };
+        assert_eq!(observation.sequence, 7);
+        assert!(observation.published_ns > 0);
+        let action = Action { answers: 7, published_ns: 0, source: 0, reserved: 0, action: [0.5; 4] };
+        controller.send(action).unwrap();
+        let (Wait::Message(answer), _) = simulator.wait_action(SOON).unwrap() else { panic!("no action") };
+        assert_eq!((answer.answers, answer.action), (7, [0.5; 4]));
+        simulator.close().unwrap();
+        assert!(matches!(controller.wait_observation(SOON).unwrap(), Wait::Closed));
+        drop((observation, controller));
+        assert_eq!(list_leftovers(&settings.prefix.unwrap()).unwrap(), Vec::<String>::new());
+    }
+
+    #[test]
+    fn only_the_newest_observation_is_kept() {
+        let settings = settings("newest");
+        let simulator = SimulatorLink::open(settings.clone()).unwrap();
+        let controller = ControllerLink::open(settings).unwrap();
+        for sequence in 0..5 {
+            simulator.publish(|observation| observation.sequence = sequence).unwrap();
+        }
+        let Wait::Message(observation) = controller.wait_observation(SOON).unwrap() else {
+            panic!("no observation")
+        };
+        assert_eq!(observation.sequence, 4);
+        assert!(matches!(controller.wait_observation(Duration::from_millis(20)).unwrap(), Wait::TimedOut));
+    }
+
+    #[test]
+    fn a_second_simulator_and_a_second_controller_are_refused() {
+        let settings = settings("second");
+        let _simulator = SimulatorLink::open(settings.clone()).unwrap();
+        let _controller = ControllerLink::open(settings.clone()).unwrap();
+        let error = SimulatorLink::open(settings.clone()).err().unwrap();
+        assert!(matches!(error, LinkError::Taken { role: "simulator", .. }), "{error}");
+        let error = ControllerLink::open(settings).err().unwrap();
+        assert!(matches!(error, LinkError::Taken { role: "controller", .. }), "{error}");
+    }
+
+    #[test]
+    fn a_peer_of_another_version_is_refused() {
+        #[derive(Debug, Clone, Copy, ZeroCopySend)]
+        #[type_name("rcwm.Observation.v0")]
+        #[repr(C)]
+        struct OldObservation {
+            sequence: u64,
+        }
+        let settings = settings("version");
+        let node = make_node(&settings).unwrap();
+        let _old = Direction::<OldObservation>::open(&node, &settings.instance, "observation").unwrap();
+        let error = ControllerLink::open(settings).err().unwrap();
+        assert!(error.to_string().contains("rcwm.Observation.v1"), "{error}");
+    }
+
+    #[test]
+    fn names_that_shared_memory_cannot_carry_are_refused() {
+        for instance in ["", "a/b", "..", "with space"] {
+            let settings = LinkSettings { instance: instance.into(), ..settings("names") };
+            assert!(matches!(SimulatorLink::open(settings), Err(LinkError::InstanceName(_))), "{instance:?}");
+        }
+        let settings = LinkSettings { prefix: Some("a/b".into()), ..settings("names") };
+        assert!(matches!(SimulatorLink::open(settings), Err(LinkError::Prefix(_))));
+    }
 }

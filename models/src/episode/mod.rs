@@ -1,0 +1,298 @@
+//! Recorded episodes as Dreamer's `.npz` files, so that data moves both ways between this project and DreamerV3 code.
+//!
+//! | key | type | shape | meaning |
+//! | --- | --- | --- | --- |
+//! | `image` | u8 | [T, 64, 64, 3] | upright, RGB |
+//! | `action` | f32 | [T, 4] | the action that LED TO `image[t]`; zeros at the first |
+//! | `reward` | f32 | [T] | of that transition |
+//! | `is_first`, `is_last`, `is_terminal`, `success` | bool | [T] | |
+//! | `robot_mask` (optional) | u8 | [T, 64, 64, 1] | 1 where the robot is, else 0 |
+//! | `proprio` (optional) | f32 | [T, 18] | joint positions and velocities |
+
+mod npz;
+
+use std::path::{Path, PathBuf};
+
+use ndarray::{Array1, Array2, Array3, Array4};
+
+use crate::files::{FileError, read_capped, write_atomic};
+use crate::wire::{Observation, ObservationFlags};
+use crate::{ACTION_LEN, IMAGE_CHANNELS, IMAGE_SIDE, PROPRIOCEPTION_LEN};
+
+/// Longest episode accepted, in steps.
+pub const STEPS_MAX: usize = 100_000;
+/// Largest episode file accepted, in bytes.
+pub const EPISODE_BYTES_MAX: u64 = 1 << 30;
+
+/// One episode, or the part of one that was seen.
+#[derive(Debug, Clone, PartialEq)]
+pub struct Episode {
+    /// [T, 64, 64, 3].
+    pub image: Array4<u8>,
+    /// [T, 4]: the action that led to the image of the same step.
+    pub action: Array2<f32>,
+    /// [T].
+    pub reward: Array1<f32>,
+    /// [T].
+    pub is_first: Array1<bool>,
+    /// [T].
+    pub is_last: Array1<bool>,
+    /// [T].
+    pub is_terminal: Array1<bool>,
+    /// [T].
+    pub success: Array1<bool>,
+    /// [T, 64, 64], true where the robot is.
+    pub robot_mask: Option<Array3<bool>>,
+    /// [T, 18].
+    pub proprio: Option<Array2<f32>>,
+}
+
+/// Why an episode could not be read, made or written.
+#[derive(Debug, thiserror::Error)]
+pub enum EpisodeError {
+    /// The file could not be read or written.
+    #[error("episode: {0}")]
+    File(#[from] FileError),
+    /// Not an archive of arrays, or a damaged one.
+    #[error("episode {path}: {reason}")]
+    Archive {
+        /// The file.
+        path: PathBuf,
+        /// What is wrong.
+        reason: String,
+    },
+    /// An array is missing.
+    #[error(
+        "episode {path}: array {key:?} is missing; expected Dreamer's keys (image, action, reward, is_first, ...)"
+    )]
+    Missing {
+        /// The file.
+        path: PathBuf,
+        /// The array's name.
+        key: &'static str,
+    },
+    /// An array has another type or shape than it must have.
+    #[error("episode {path}: array {key:?} is {found}, expected {expected}")]
+    Array {
+        /// The file.
+        path: PathBuf,
+        /// The array's name.
+        key: &'static str,
+        /// What it is.
+        found: String,
+        /// What it must be.
+        expected: String,
+    },
+    /// An observation that does not continue the episode.
+    #[error("recording: {0}")]
+    Order(String),
+}
+
+impl Episode {
+    /// Steps, `T`.
+    #[must_use]
+    pub fn len(&self) -> usize {
+        self.reward.len()
+    }
+
+    /// Whether it holds no step.
+    #[must_use]
+    pub fn is_empty(&self) -> bool {
+        self.reward.is_empty()
+    }
+
+    /// Sum of the rewards.
+    #[must_use]
+    pub fn total_reward(&self) -> f64 {
+        self.reward.iter().map(|reward| f64::from(*reward)).sum()
+    }
+
+    /// Whether the task was solved at any step.
+    #[must_use]
+    pub fn succeeded(&self) -> bool {
+        self.success.iter().any(|success| *success)
+    }
+
+    /// Reads a `.npz` file; every array's size is checked before it is unpacked.
+    ///
+    /// # Errors
+    /// See [`EpisodeError`].
+    pub fn read(path: &Path) -> Result<Self, EpisodeError> {
+        let bytes = read_capped(path, EPISODE_BYTES_MAX)?;
+        npz::read(path, &bytes)
+    }
+
+    /// Writes a compressed `.npz` file atomically.
+    ///
+    /// # Errors
+    /// See [`EpisodeError`].
+    pub fn write(&self, path: &Path) -> Result<(), EpisodeError> {
+        let bytes = npz::to_bytes(self)
+            .map_err(|reason| EpisodeError::Archive { path: path.to_path_buf(), reason })?;
+        Ok(write_atomic(path, &bytes)?)
+    }
+}
+
+/// Collects observations into an [`Episode`].
+#[derive(Debug, Default)]
+pub struct EpisodeBuilder {
+    image: Vec<u8>,
+    action: Vec<f32>,
+    reward: Vec<f32>,
+    flags: Vec<ObservationFlags>,
+    robot_mask: Vec<bool>,
+    masks: usize,
+    proprio: Vec<f32>,
+}
+
+impl EpisodeBuilder {
+    /// An empty episode.
+    #[must_use]
+    pub fn new() -> Self {
+        Self::default()
+    }
+
+    /// Steps so far.
+    #[must_use]
+    pub fn len(&self) -> usize {
+        self.flags.len()
+    }
+
+    /// Whether nothing was pushed yet.
+    #[must_use]
+    pub fn is_empty(&self) -> bool {
+        self.flags.is_empty()
+    }
+
+    /// Adds an observation. The first one pushed counts as the episode's first.
+    ///
+    /// # Errors
+    /// [`EpisodeError::Order`] when the episode was already over, begins again in its middle, grows beyond
+    /// [`STEPS_MAX`], or the observation holds a number that is not finite.
+    pub fn push(&mut self, observation: &Observation) -> Result<(), EpisodeError> {
+        let flags = ObservationFlags(observation.flags);
+        let refuse = |reason: &str| {
+            let (episode, step) = (observation.episode, observation.step);
+            Err(EpisodeError::Order(format!("episode {episode}, step {step}: {reason}")))
+        };
+        if self.flags.last().is_some_and(|last| last.contains(ObservationFlags::LAST)) {
+            return refuse("the episode was already over");
+        }
+        if !self.is_empty() && flags.contains(ObservationFlags::FIRST) {
+            return refuse("a new episode began before the last one was finished");
+        }
+        if self.len() == STEPS_MAX {
+            return refuse("the episode is too long");
+        }
+        if !observation.is_finite() {
+            return refuse("a number is not finite");
+        }
+        self.image.extend_from_slice(&observation.image);
+        self.action.extend_from_slice(&observation.executed_action);
+        self.reward.push(observation.reward);
+        self.flags.push(flags);
+        self.robot_mask.extend(observation.robot_mask.iter().map(|pixel| *pixel > 127));
+        self.masks += usize::from(flags.contains(ObservationFlags::MASK_VALID));
+        self.proprio.extend_from_slice(&observation.proprioception);
+        Ok(())
+    }
+
+    /// The episode, with masks only if every step had one; `None` if nothing was pushed. The builder is empty afterwards.
+    #[must_use]
+    pub fn finish(&mut self) -> Option<Episode> {
+        let this = std::mem::take(self);
+        let steps = this.len();
+        if steps == 0 {
+            return None;
+        }
+        let bits = |flag| this.flags.iter().map(|flags| flags.contains(flag)).collect::<Array1<bool>>();
+        let mut is_first = bits(ObservationFlags::FIRST);
+        is_first[0] = true;
+        let fits = "pushed in whole steps";
+        Some(Episode {
+            is_last: bits(ObservationFlags::LAST),
+            is_terminal: bits(ObservationFlags::TERMINAL),
+            success: bits(ObservationFlags::SUCCESS),
+            is_first,
+            image: Array4::from_shape_vec((steps, IMAGE_SIDE, IMAGE_SIDE, IMAGE_CHANNELS), this.image)
+                .expect(fits),
+            action: Array2::from_shape_vec((steps, ACTION_LEN), this.action).expect(fits),
+            reward: this.reward.into(),
+            robot_mask: (this.masks == steps).then(|| {
+                Array3::from_shape_vec((steps, IMAGE_SIDE, IMAGE_SIDE), this.robot_mask).expect(fits)
+            }),
+            proprio: Some(Array2::from_shape_vec((steps, PROPRIOCEPTION_LEN), this.proprio).expect(fits)),
+        })
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn observation(step: u32, last: bool, mask: bool) -> Observation {
+        let mut observation = Observation::zeroed();
+        observation.step = step;
+        observation.flags = ObservationFlags::default()
+            .with(ObservationFlags::FIRST, step == 0)
+            .with(ObservationFlags::LAST, last)
+            .with(ObservationFlags::MASK_VALID, mask)
+            .0;
+        observation.reward = step as f32;
+        observation.image[step as usize] = 200;
+        observation.robot_mask[step as usize] = 255;
+        observation.executed_action[1] = -0.25;
+        observation.proprioception[17] = 0.5;
+        observation
+    }
+
+    #[test]
+    fn an_episode_survives_the_file() {
+        let mut builder = EpisodeBuilder::new();
+        for step in 0..4 {
+            builder.push(&observation(step, step == 3, true)).unwrap();
+        }
+        let episode = builder.finish().unwrap();
+        let folder = tempfile::tempdir().unwrap();
+        let path = folder.path().join("episode.npz");
+        episode.write(&path).unwrap();
+        assert_eq!(Episode::read(&path).unwrap(), episode);
+        assert_eq!((episode.len(), episode.total_reward()), (4, 6.0));
+        assert!(episode.is_last[3] && !episode.is_last[2]);
+    }
+
+    #[test]
+    fn masks_are_kept_only_when_every_step_has_one() {
+        let mut builder = EpisodeBuilder::new();
+        builder.push(&observation(0, false, true)).unwrap();
+        builder.push(&observation(1, true, false)).unwrap();
+        assert!(builder.finish().unwrap().robot_mask.is_none());
+        assert!(builder.finish().is_none(), "the builder starts anew");
+    }
+
+    #[test]
+    fn an_episode_neither_restarts_nor_goes_on_after_its_end() {
+        let mut builder = EpisodeBuilder::new();
+        builder.push(&observation(0, false, true)).unwrap();
+        assert!(builder.push(&observation(0, false, true)).is_err());
+        builder.push(&observation(1, true, true)).unwrap();
+        assert!(builder.push(&observation(2, false, true)).is_err());
+        let mut poisoned = observation(0, false, true);
+        poisoned.reward = f32::NAN;
+        assert!(EpisodeBuilder::new().push(&poisoned).is_err());
+    }
+
+    #[test]
+    fn a_damaged_file_is_one_clear_error() {
+        let mut builder = EpisodeBuilder::new();
+        builder.push(&observation(0, true, true)).unwrap();
+        let folder = tempfile::tempdir().unwrap();
+        let path = folder.path().join("episode.npz");
+        builder.finish().unwrap().write(&path).unwrap();
+        let bytes = std::fs::read(&path).unwrap();
+        for len in (0..bytes.len()).step_by(97) {
+            std::fs::write(&path, &bytes[..len]).unwrap();
+            assert!(Episode::read(&path).is_err(), "{len} bytes were accepted");
+        }
+    }
+}
