@@ -498,6 +498,9 @@ impl ControllerLink {
 
 /// Files of this prefix that are left in shared memory, after dead peers were cleaned up. Empty when no peer is alive.
 ///
+/// iceoryx2's node counter (16 bytes a prefix, shared by all programs, kept by design) is not counted; see
+/// [`forget_prefix`].
+///
 /// # Errors
 /// [`LinkError::Node`] when shared memory cannot be read.
 pub fn list_leftovers(prefix: &str) -> Result<Vec<String>, LinkError> {
@@ -510,33 +513,52 @@ pub fn list_leftovers(prefix: &str) -> Result<Vec<String>, LinkError> {
         CallbackProgression::Continue
     })
     .map_err(|error| LinkError::Node(format!("{error:?}")))?;
-    let mut left = Vec::new();
-    for folder in ["/dev/shm", "/tmp/iceoryx2", "/tmp/iceoryx2/services", "/tmp/iceoryx2/nodes"] {
-        let Ok(entries) = std::fs::read_dir(folder) else { continue };
-        left.extend(
-            entries
-                .flatten()
-                .filter(|entry| entry.file_name().to_string_lossy().starts_with(prefix))
-                .map(|entry| entry.path().display().to_string()),
-        );
+    Ok(files_of(prefix).filter(|path| !path.ends_with(NODE_COUNTER_SUFFIX)).collect())
+}
+
+/// Removes iceoryx2's node counter of a prefix that no process uses any more: a test's own, for example.
+pub fn forget_prefix(prefix: &str) {
+    for counter in files_of(prefix).filter(|path| path.ends_with(NODE_COUNTER_SUFFIX)) {
+        // Somebody else may have removed it: it is gone either way.
+        let _ = std::fs::remove_file(counter);
     }
-    Ok(left)
+}
+
+const NODE_COUNTER_SUFFIX: &str = ".global_mgmt";
+
+fn files_of(prefix: &str) -> impl Iterator<Item = String> + '_ {
+    ["/dev/shm", "/tmp/iceoryx2", "/tmp/iceoryx2/services", "/tmp/iceoryx2/nodes"]
+        .into_iter()
+        .filter_map(|folder| std::fs::read_dir(folder).ok())
+        .flat_map(|entries| entries.flatten())
+        .filter(move |entry| entry.file_name().to_string_lossy().starts_with(prefix))
+        .map(|entry| entry.path().display().to_string())
 }
 
 #[cfg(test)]
 mod tests {
     use super::*;
 
-    fn settings(name: &str) -> LinkSettings {
+    /// Settings under a prefix of their own, which is forgotten at the end.
+    struct Domain(LinkSettings);
+
+    impl Drop for Domain {
+        fn drop(&mut self) {
+            forget_prefix(self.0.prefix.as_deref().unwrap());
+        }
+    }
+
+    fn domain(name: &str) -> (LinkSettings, Domain) {
         let prefix = Some(format!("rcwm_unit_{}_{name}_", std::process::id()));
-        LinkSettings { instance: name.to_owned(), prefix, spin: Duration::ZERO }
+        let settings = LinkSettings { instance: name.to_owned(), prefix, spin: Duration::ZERO };
+        (settings.clone(), Domain(settings))
     }
 
     const SOON: Duration = Duration::from_secs(5);
 
     #[test]
     fn an_observation_goes_over_and_its_answer_comes_back() {
-        let settings = settings("both_ways");
+        let (settings, _domain) = domain("both_ways");
         let simulator = SimulatorLink::open(settings.clone()).unwrap();
         let controller = ControllerLink::open(settings.clone()).unwrap();
         assert!(simulator.poll_events().unwrap().hello, "a new controller announces itself");
@@ -558,7 +580,7 @@ mod tests {
 
     #[test]
     fn only_the_newest_observation_is_kept() {
-        let settings = settings("newest");
+        let (settings, _domain) = domain("newest");
         let simulator = SimulatorLink::open(settings.clone()).unwrap();
         let controller = ControllerLink::open(settings).unwrap();
         for sequence in 0..5 {
@@ -573,7 +595,7 @@ mod tests {
 
     #[test]
     fn a_second_simulator_and_a_second_controller_are_refused() {
-        let settings = settings("second");
+        let (settings, _domain) = domain("second");
         let _simulator = SimulatorLink::open(settings.clone()).unwrap();
         let _controller = ControllerLink::open(settings.clone()).unwrap();
         let error = SimulatorLink::open(settings.clone()).err().unwrap();
@@ -590,7 +612,7 @@ mod tests {
         struct OldObservation {
             sequence: u64,
         }
-        let settings = settings("version");
+        let (settings, _domain) = domain("version");
         let node = make_node(&settings).unwrap();
         let _old = Direction::<OldObservation>::open(&node, &settings.instance, "observation").unwrap();
         let error = ControllerLink::open(settings).err().unwrap();
@@ -599,11 +621,12 @@ mod tests {
 
     #[test]
     fn names_that_shared_memory_cannot_carry_are_refused() {
+        let (settings, _domain) = domain("names");
         for instance in ["", "a/b", "..", "with space"] {
-            let settings = LinkSettings { instance: instance.into(), ..settings("names") };
+            let settings = LinkSettings { instance: instance.into(), ..settings.clone() };
             assert!(matches!(SimulatorLink::open(settings), Err(LinkError::InstanceName(_))), "{instance:?}");
         }
-        let settings = LinkSettings { prefix: Some("a/b".into()), ..settings("names") };
+        let settings = LinkSettings { prefix: Some("a/b".into()), ..settings };
         assert!(matches!(SimulatorLink::open(settings), Err(LinkError::Prefix(_))));
     }
 }

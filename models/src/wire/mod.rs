@@ -21,6 +21,6 @@ mod messages;
 
 pub use link::{
     ControllerLink, Events, LinkError, LinkSettings, ObservationSample, ObservationSlot, SimulatorLink, Wait,
-    list_leftovers,
+    forget_prefix, list_leftovers,
 };
 pub use messages::{Action, ActionSource, Observation, ObservationFlags};
