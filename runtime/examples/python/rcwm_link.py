@@ -1,0 +1,197 @@
+"""The RCWM wire in Python: messages and both ends of the shared-memory link.
+
+Copy this file beside your own robot's program. It needs only PyPI's `iceoryx2` (0.10.0); numpy is optional.
+The layouts are those of `models/src/wire/messages.rs`; the type names carry the version, so that a peer of another
+version is refused when it connects.
+"""
+
+import ctypes
+import os
+import time
+
+import iceoryx2 as iox2
+
+IMAGE_SIDE = 64
+FIRST, LAST, TERMINAL, SUCCESS, MASK_VALID, ACTION_HELD, REPEATED = (1 << bit for bit in range(7))
+SOURCES = ("policy", "imagined", "fallback")
+OWN_TASK = 0xFFFF_FFFF
+
+_PUBLISHED, _HELLO, _CLOSED = 0, 1, 2
+_SUBSCRIBERS_MAX, _NODES_MAX, _EVENT_ID_MAX = 8, 16, 7
+
+
+class Observation(ctypes.Structure):
+    """What a simulator or robot saw, and what it had done to get there. Times: CLOCK_MONOTONIC, ns."""
+
+    _fields_ = [
+        ("sequence", ctypes.c_uint64),  # counts up by one, from 0
+        ("episode", ctypes.c_uint64),
+        ("scheduled_ns", ctypes.c_uint64),
+        ("published_ns", ctypes.c_uint64),
+        ("period_ns", ctypes.c_uint64),  # 0: lock-step
+        ("step", ctypes.c_uint32),
+        ("flags", ctypes.c_uint32),
+        ("task", ctypes.c_uint32),
+        ("reward", ctypes.c_float),
+        ("executed_action", ctypes.c_float * 4),
+        ("proprioception", ctypes.c_float * 18),
+        ("image", ctypes.c_uint8 * (IMAGE_SIDE * IMAGE_SIDE * 3)),  # upright, rows first, RGB
+        ("robot_mask", ctypes.c_uint8 * (IMAGE_SIDE * IMAGE_SIDE)),  # 255 where the robot is
+    ]
+
+    @staticmethod
+    def type_name() -> str:
+        return "rcwm.Observation.v1"
+
+
+class Action(ctypes.Structure):
+    """A controller's answer to one observation; each component in [-1, 1]."""
+
+    _fields_ = [
+        ("answers", ctypes.c_uint64),
+        ("published_ns", ctypes.c_uint64),
+        ("source", ctypes.c_uint32),
+        ("reserved", ctypes.c_uint32),
+        ("action", ctypes.c_float * 4),
+    ]
+
+    @staticmethod
+    def type_name() -> str:
+        return "rcwm.Action.v1"
+
+
+class PeerClosed(Exception):
+    """The other side said that it closes."""
+
+
+class _Link:
+    def __init__(self, instance: str):
+        iox2.set_log_level_from_env_or(iox2.LogLevel.Error)
+        config = iox2.config.default()
+        prefix = os.environ.get("RCWM_PREFIX")
+        if prefix:
+            config.global_cfg.prefix = iox2.FileName.new(prefix)
+        self._node = (
+            iox2.NodeBuilder.new()
+            .config(config)
+            .signal_handling_mode(iox2.SignalHandlingMode.Disabled)
+            .create(iox2.ServiceType.Ipc)
+        )
+        self._instance = instance
+
+    def _direction(self, topic: str, message: type):
+        name = iox2.ServiceName.new(f"rcwm/{self._instance}/{topic}")
+        data = (
+            self._node.service_builder(name)
+            .publish_subscribe(message)
+            .history_size(0)
+            .subscriber_max_buffer_size(1)
+            .subscriber_max_borrowed_samples(2)
+            .enable_safe_overflow(True)
+            .max_publishers(1)
+            .max_subscribers(_SUBSCRIBERS_MAX)
+            .max_nodes(_NODES_MAX)
+            .open_or_create()
+        )
+        event = (
+            self._node.service_builder(name)
+            .event()
+            .max_notifiers(_SUBSCRIBERS_MAX)
+            .max_listeners(_SUBSCRIBERS_MAX)
+            .max_nodes(_NODES_MAX)
+            .event_id_max_value(_EVENT_ID_MAX)
+            .open_or_create()
+        )
+        return data, event
+
+    def _send(self, message) -> None:
+        message.published_ns = time.monotonic_ns()
+        self._publisher.loan_uninit().write_payload(message).send()
+        self._notify(_PUBLISHED)
+
+    def _notify(self, event_id: int) -> None:
+        self._notifier.notify_with_custom_event_id(iox2.EventId.new(event_id))
+
+    def _receive(self, timeout_s: float):
+        """The newest message and the events seen, or (None, events) when the time is up."""
+        deadline = time.monotonic() + timeout_s
+        events: set[int] = set()
+        while True:
+            sample = self._subscriber.receive()
+            if sample is not None:
+                # A copy: the sample's memory goes back to its publisher at the end of this function.
+                return type(sample.payload().contents).from_buffer_copy(sample.payload().contents), events
+            left_s = deadline - time.monotonic()
+            if events or left_s <= 0:
+                return None, events
+            activations = self._listener.timed_wait(iox2.Duration.from_secs_f64(left_s))
+            events.update(seen.id.as_value for seen in activations if seen.id.as_value != _PUBLISHED)
+
+    def close(self) -> None:
+        """Tells the peer that nothing more will come, and leaves shared memory clean."""
+        self._notify(_CLOSED)
+        for port in (self._publisher, self._subscriber, self._notifier, self._listener):
+            port.delete()
+
+
+class ControllerLink(_Link):
+    """A controller's end: observations in, actions out."""
+
+    def __init__(self, instance: str):
+        super().__init__(instance)
+        observation_data, observation_event = self._direction("observation", Observation)
+        action_data, action_event = self._direction("action", Action)
+        self._subscriber = observation_data.subscriber_builder().create()
+        self._listener = observation_event.listener_builder().create()
+        self._publisher = action_data.publisher_builder().create()
+        self._notifier = action_event.notifier_builder().create()
+        # The simulator publishes its current observation again for a controller that has just connected.
+        self._notify(_HELLO)
+
+    def observe(self, timeout_s: float) -> Observation | None:
+        """The next observation, or None when the time is up. Raises PeerClosed when the simulator has ended."""
+        deadline = time.monotonic() + timeout_s
+        while True:
+            observation, events = self._receive(max(0.0, deadline - time.monotonic()))
+            if observation is not None:
+                return observation
+            if _CLOSED in events:
+                raise PeerClosed("the simulator has closed")
+            if time.monotonic() >= deadline:
+                return None
+
+    def act(self, observation: Observation, action, source: str = "policy") -> None:
+        """Answers an observation with four numbers in [-1, 1]."""
+        answer = Action(answers=observation.sequence, source=SOURCES.index(source))
+        answer.action[:] = [min(1.0, max(-1.0, float(value))) for value in action]
+        self._send(answer)
+
+
+class SimulatorLink(_Link):
+    """A simulator's or robot's end: observations out, actions in."""
+
+    def __init__(self, instance: str):
+        super().__init__(instance)
+        observation_data, observation_event = self._direction("observation", Observation)
+        action_data, action_event = self._direction("action", Action)
+        self._subscriber = action_data.subscriber_builder().create()
+        self._listener = action_event.listener_builder().create()
+        self._publisher = observation_data.publisher_builder().create()
+        self._notifier = observation_event.notifier_builder().create()
+
+    def step(self, observation: Observation, timeout_s: float) -> Action | None:
+        """Publishes an observation and waits for the action that answers it (lock-step).
+
+        A controller that connects in the meantime gets the observation again. None when the time is up.
+        """
+        deadline = time.monotonic() + timeout_s
+        self._send(observation)
+        while True:
+            action, events = self._receive(max(0.0, deadline - time.monotonic()))
+            if action is not None and action.answers == observation.sequence:
+                return action
+            if _HELLO in events:
+                observation.flags |= REPEATED
+                self._send(observation)
+            if time.monotonic() >= deadline:
+                return None
