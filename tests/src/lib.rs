@@ -1,1 +1,240 @@
-//! Placeholder.
+//! What the tests across processes share: the built binaries, a shared-memory domain of their own, children that never outlive
+//! a test.
+//!
+//! The binaries are those beside the test's own in the target folder; `make test` builds them first.
+
+use std::io::Read;
+use std::path::{Path, PathBuf};
+use std::process::{Child, Command, ExitStatus, Output, Stdio};
+use std::sync::atomic::{AtomicU32, Ordering};
+use std::time::{Duration, Instant};
+
+use rcwm_models::wire::{forget_prefix, list_leftovers};
+
+/// How long anything in a test may take before it counts as hung.
+pub const PATIENCE: Duration = Duration::from_secs(120);
+
+/// The root of the repository.
+#[must_use]
+pub fn root() -> PathBuf {
+    Path::new(env!("CARGO_MANIFEST_DIR")).parent().expect("the tests are a member of the workspace").to_path_buf()
+}
+
+/// The bundle that is shipped for the demo.
+#[must_use]
+pub fn shipped_bundle() -> PathBuf {
+    root().join("models/bundles/untrained")
+}
+
+/// A built binary of this workspace.
+///
+/// # Panics
+/// When it was not built: `cargo build --release --workspace --bins`.
+#[must_use]
+pub fn binary(name: &str) -> PathBuf {
+    let own = std::env::current_exe().expect("a test has a path");
+    // target/release/deps/test-1234 -> target/release
+    let folder = own.parent().and_then(Path::parent).expect("tests lie in target/<profile>/deps");
+    let path = folder.join(name);
+    assert!(path.is_file(), "{} is missing: build it first with `make test`, or cargo build --release --workspace --bins", path.display());
+    path
+}
+
+/// The interpreter of the project's Python environment.
+///
+/// # Panics
+/// When it was not set up.
+#[must_use]
+pub fn python() -> PathBuf {
+    let path = root().join(".venv/bin/python");
+    assert!(path.exists(), "{} is missing: run scripts/setup test", path.display());
+    path
+}
+
+/// A shared-memory domain that only this test uses.
+#[derive(Debug)]
+pub struct Domain {
+    prefix: String,
+}
+
+impl Domain {
+    /// A new domain.
+    #[must_use]
+    #[expect(clippy::new_without_default, reason = "every domain is another one")]
+    pub fn new() -> Self {
+        static COUNT: AtomicU32 = AtomicU32::new(0);
+        let prefix = format!("rcwm_t{}_{}_", std::process::id(), COUNT.fetch_add(1, Ordering::Relaxed));
+        Self { prefix }
+    }
+
+    /// The prefix of its files.
+    #[must_use]
+    pub fn prefix(&self) -> &str {
+        &self.prefix
+    }
+
+    /// A command for a built binary in this domain.
+    #[must_use]
+    pub fn command(&self, name: &str) -> Command {
+        self.within(Command::new(binary(name)))
+    }
+
+    /// A command for a Python program in this domain.
+    #[must_use]
+    pub fn python(&self, script: &Path) -> Command {
+        let mut command = Command::new(python());
+        command.arg(script);
+        self.within(command)
+    }
+
+    fn within(&self, mut command: Command) -> Command {
+        command.env("RCWM_PREFIX", &self.prefix).env("RUST_BACKTRACE", "0").stdin(Stdio::null());
+        command
+    }
+
+    /// Files left in shared memory once nobody is alive.
+    ///
+    /// # Panics
+    /// When shared memory cannot be read.
+    #[must_use]
+    pub fn leftovers(&self) -> Vec<String> {
+        list_leftovers(&self.prefix).expect("shared memory can be read")
+    }
+}
+
+impl Drop for Domain {
+    fn drop(&mut self) {
+        forget_prefix(&self.prefix);
+    }
+}
+
+/// A child process that is killed when the test forgets it. Its output goes to files, so that it never blocks.
+#[derive(Debug)]
+pub struct Running {
+    child: Child,
+    name: String,
+    output: tempfile::NamedTempFile,
+}
+
+impl Running {
+    /// Starts a command.
+    ///
+    /// # Panics
+    /// When it cannot be started.
+    #[must_use]
+    pub fn start(mut command: Command) -> Self {
+        let name = format!("{:?}", command.get_program());
+        let output = tempfile::NamedTempFile::new().expect("a temporary file");
+        let (out, err) = (output.reopen().expect("reopen"), output.reopen().expect("reopen"));
+        let append = |file: std::fs::File| {
+            rustix::fs::fcntl_setfl(&file, rustix::fs::OFlags::APPEND).expect("append mode");
+            file
+        };
+        let child = command.stdout(append(out)).stderr(append(err)).spawn();
+        let child = child.unwrap_or_else(|error| panic!("{name} does not start: {error}"));
+        Self { child, name, output }
+    }
+
+    /// Everything it has printed so far.
+    ///
+    /// # Panics
+    /// When the file of its output cannot be read.
+    #[must_use]
+    pub fn printed(&self) -> String {
+        let mut bytes = Vec::new();
+        self.output.reopen().expect("reopen").read_to_end(&mut bytes).expect("output can be read");
+        String::from_utf8_lossy(&bytes).into_owned()
+    }
+
+    /// Whether it still runs.
+    ///
+    /// # Panics
+    /// When the system does not say.
+    #[must_use]
+    pub fn is_running(&mut self) -> bool {
+        self.child.try_wait().expect("its state is known").is_none()
+    }
+
+    /// Sends a signal.
+    ///
+    /// # Panics
+    /// When it is gone already.
+    pub fn signal(&self, signal: rustix::process::Signal) {
+        let pid = rustix::process::Pid::from_child(&self.child);
+        rustix::process::kill_process(pid, signal).expect("it takes signals");
+    }
+
+    /// Kills it without warning (SIGKILL) and waits until it is gone.
+    ///
+    /// # Panics
+    /// When it was gone already.
+    pub fn kill(mut self) {
+        self.child.kill().expect("it can be killed");
+        self.child.wait().expect("it is gone");
+    }
+
+    /// Waits for its end.
+    ///
+    /// # Panics
+    /// When it has not ended within [`PATIENCE`].
+    pub fn end(&mut self) -> ExitStatus {
+        let start = Instant::now();
+        while start.elapsed() < PATIENCE {
+            if let Some(status) = self.child.try_wait().expect("its state is known") {
+                return status;
+            }
+            std::thread::sleep(Duration::from_millis(5));
+        }
+        panic!("{} still runs after {PATIENCE:?}; it printed:\n{}", self.name, self.printed());
+    }
+
+    /// Waits for its end, which must be a success.
+    ///
+    /// # Panics
+    /// When it fails or hangs.
+    pub fn succeed(&mut self) {
+        let status = self.end();
+        assert!(status.success(), "{} ended with {status}; it printed:\n{}", self.name, self.printed());
+    }
+}
+
+impl Drop for Running {
+    fn drop(&mut self) {
+        if self.child.try_wait().is_ok_and(|status| status.is_none()) {
+            // A test that failed: nothing more can be done about a child that does not die.
+            let _ = self.child.kill();
+            let _ = self.child.wait();
+        }
+    }
+}
+
+/// Runs a command to its end and gives what it printed.
+///
+/// # Panics
+/// When it cannot be started.
+#[must_use]
+pub fn output(mut command: Command) -> Output {
+    command.output().unwrap_or_else(|error| panic!("{:?} does not start: {error}", command.get_program()))
+}
+
+/// Waits until `condition` holds.
+///
+/// # Panics
+/// When it does not within [`PATIENCE`].
+pub fn eventually(what: &str, mut condition: impl FnMut() -> bool) {
+    let start = Instant::now();
+    while !condition() {
+        assert!(start.elapsed() < PATIENCE, "{what}: not within {PATIENCE:?}");
+        std::thread::sleep(Duration::from_millis(2));
+    }
+}
+
+/// Reads a JSON file that a verb has written.
+///
+/// # Panics
+/// When it is missing or no JSON.
+#[must_use]
+pub fn read_json(path: &Path) -> serde_json::Value {
+    let text = std::fs::read_to_string(path).unwrap_or_else(|error| panic!("{}: {error}", path.display()));
+    serde_json::from_str(&text).unwrap_or_else(|error| panic!("{}: {error}\n{text}", path.display()))
+}

@@ -1,0 +1,34 @@
+# The verbs people and CI use. Every verb does its own set-up, once.
+SHELL := /bin/bash
+export PYO3_PYTHON := $(CURDIR)/.venv/bin/python
+CARGO ?= cargo
+BUNDLE ?= models/bundles/untrained
+TASK ?= button-press
+EPISODES ?= 2
+OUT ?= runs/demo
+BIN = $${CARGO_TARGET_DIR:-target}/release
+
+.PHONY: help demo test lint bench clean
+
+help: ## What there is
+	@grep -hE '^[a-z-]+:.*##' $(MAKEFILE_LIST) | sed -E 's/:.*## /\t/' | expand -t 10
+
+demo: ## Simulator and controller over shared memory: summary and a film in runs/demo
+	@scripts/setup demo
+	$(CARGO) build --release --locked -p rcwm-simulator -p rcwm-runtime
+	@scripts/demo "$(BUNDLE)" "$(TASK)" "$(EPISODES)" "$(OUT)"
+
+test: ## Everything that can be tested on one machine
+	@scripts/setup test
+	$(CARGO) build --release --locked --workspace --bins --examples
+	ORT_DYLIB_PATH="$${ORT_DYLIB_PATH:-$$(scripts/onnxruntime-library)}" $(CARGO) test --release --locked --workspace
+
+lint: ## Formatting, clippy with warnings denied, licences (where cargo-deny is installed)
+	@scripts/setup demo
+	$(CARGO) fmt --all --check
+	$(CARGO) clippy --release --locked --workspace --all-targets -- -D warnings
+	@if $(CARGO) deny --version >/dev/null 2>&1; then $(CARGO) deny --offline check bans licenses sources; \
+	else echo "lint: cargo-deny is not installed, licences were not checked (cargo install cargo-deny)"; fi
+
+clean: ## Remove what was built and installed here
+	rm -rf target .venv runs
