@@ -78,6 +78,7 @@ class _Link:
             .create(iox2.ServiceType.Ipc)
         )
         self._instance = instance
+        self._seen: set[int] = set()
 
     def _direction(self, topic: str, message: type):
         name = iox2.ServiceName.new(f"rcwm/{self._instance}/{topic}")
@@ -113,19 +114,22 @@ class _Link:
         self._notifier.notify_with_custom_event_id(iox2.EventId.new(event_id))
 
     def _receive(self, timeout_s: float):
-        """The newest message and the events seen, or (None, events) when the time is up."""
+        """The newest message, or None when the time is up or a signal other than a message has come.
+
+        Signals are kept in `self._seen` until they are acted upon: a message that came with one goes first.
+        """
         deadline = time.monotonic() + timeout_s
-        events: set[int] = set()
         while True:
             sample = self._subscriber.receive()
             if sample is not None:
                 # A copy: the sample's memory goes back to its publisher at the end of this function.
-                return type(sample.payload().contents).from_buffer_copy(sample.payload().contents), events
+                message = sample.payload().contents
+                return type(message).from_buffer_copy(message)
             left_s = deadline - time.monotonic()
-            if events or left_s <= 0:
-                return None, events
+            if self._seen or left_s <= 0:
+                return None
             activations = self._listener.timed_wait(iox2.Duration.from_secs_f64(left_s))
-            events.update(seen.id.as_value for seen in activations if seen.id.as_value != _PUBLISHED)
+            self._seen.update(seen.id.as_value for seen in activations if seen.id.as_value != _PUBLISHED)
 
     def close(self) -> None:
         """Tells the peer that nothing more will come, and leaves shared memory clean."""
@@ -152,11 +156,12 @@ class ControllerLink(_Link):
         """The next observation, or None when the time is up. Raises PeerClosed when the simulator has ended."""
         deadline = time.monotonic() + timeout_s
         while True:
-            observation, events = self._receive(max(0.0, deadline - time.monotonic()))
+            observation = self._receive(max(0.0, deadline - time.monotonic()))
             if observation is not None:
                 return observation
-            if _CLOSED in events:
+            if _CLOSED in self._seen:
                 raise PeerClosed("the simulator has closed")
+            self._seen.clear()
             if time.monotonic() >= deadline:
                 return None
 
@@ -187,11 +192,14 @@ class SimulatorLink(_Link):
         deadline = time.monotonic() + timeout_s
         self._send(observation)
         while True:
-            action, events = self._receive(max(0.0, deadline - time.monotonic()))
+            action = self._receive(max(0.0, deadline - time.monotonic()))
             if action is not None and action.answers == observation.sequence:
                 return action
-            if _HELLO in events:
+            if _HELLO in self._seen:
+                self._seen.clear()
                 observation.flags |= REPEATED
                 self._send(observation)
+            elif action is None:
+                self._seen.clear()
             if time.monotonic() >= deadline:
                 return None

@@ -1,0 +1,186 @@
+//! One direction of the link: a publish-subscribe service and the event service that wakes its receiver.
+
+use std::cell::Cell;
+use std::time::{Duration, Instant};
+
+use iceoryx2::port::listener::{Listener, ListenerWaitError};
+use iceoryx2::port::notifier::Notifier;
+use iceoryx2::port::publisher::Publisher;
+use iceoryx2::port::subscriber::Subscriber;
+use iceoryx2::prelude::*;
+use iceoryx2::sample::Sample;
+use iceoryx2::service::builder::event::EventOpenOrCreateError;
+use iceoryx2::service::builder::publish_subscribe::PublishSubscribeOpenOrCreateError;
+use iceoryx2::service::port_factory::{event, publish_subscribe};
+
+use super::error::traffic;
+use super::{Events, Ipc, LinkError, Wait};
+
+/// A message in shared memory; it stays valid while this is held.
+pub(super) type Received<T> = Sample<Ipc, T, ()>;
+
+/// Recorders and other listeners beside the controller.
+const SUBSCRIBERS_MAX: usize = 8;
+const NODES_MAX: usize = 16;
+const EVENT_ID_MAX: usize = 7;
+
+pub(super) const EVENT_PUBLISHED: usize = 0;
+pub(super) const EVENT_HELLO: usize = 1;
+pub(super) const EVENT_CLOSED: usize = 2;
+
+/// Both services of one direction.
+pub(super) struct Direction<T: ZeroCopySend + std::fmt::Debug + 'static> {
+    name: String,
+    data: publish_subscribe::PortFactory<Ipc, T, ()>,
+    event: event::PortFactory<Ipc>,
+}
+
+impl<T: ZeroCopySend + std::fmt::Debug + 'static> Direction<T> {
+    pub(super) fn open(node: &Node<Ipc>, instance: &str, topic: &str) -> Result<Self, LinkError> {
+        let name = format!("rcwm/{instance}/{topic}");
+        let service: ServiceName =
+            name.as_str().try_into().map_err(|_| LinkError::InstanceName(instance.to_owned()))?;
+        let data = node
+            .service_builder(&service)
+            .publish_subscribe::<T>()
+            .history_size(0)
+            .subscriber_max_buffer_size(1)
+            .subscriber_max_borrowed_samples(2)
+            .enable_safe_overflow(true)
+            .max_publishers(1)
+            .max_subscribers(SUBSCRIBERS_MAX)
+            .max_nodes(NODES_MAX)
+            .open_or_create()
+            .map_err(|error| Self::data_error(&name, error))?;
+        let event = node
+            .service_builder(&service)
+            .event()
+            .max_notifiers(SUBSCRIBERS_MAX)
+            .max_listeners(SUBSCRIBERS_MAX)
+            .max_nodes(NODES_MAX)
+            .event_id_max_value(EVENT_ID_MAX)
+            .open_or_create()
+            .map_err(|error: EventOpenOrCreateError| LinkError::Service {
+                service: name.clone(),
+                reason: format!("{error:?}"),
+            })?;
+        Ok(Self { name, data, event })
+    }
+
+    fn data_error(name: &str, error: PublishSubscribeOpenOrCreateError) -> LinkError {
+        use iceoryx2::service::builder::publish_subscribe::PublishSubscribeOpenError::IncompatibleTypes;
+        match error {
+            PublishSubscribeOpenOrCreateError::PublishSubscribeOpenError(IncompatibleTypes) => {
+                // SAFETY: the name is a constant; the function is marked unsafe because peers trust it.
+                let expected = unsafe { <T as ZeroCopySend>::type_name() };
+                LinkError::OtherVersion { service: name.to_owned(), expected }
+            }
+            other => LinkError::Service { service: name.to_owned(), reason: format!("{other:?}") },
+        }
+    }
+
+    pub(super) fn sender(&self, role: &'static str) -> Result<Sender<T>, LinkError> {
+        use iceoryx2::port::publisher::PublisherCreateError::ExceedsMaxSupportedPublishers;
+        let publisher =
+            self.data.publisher_builder().max_loaned_samples(1).create().map_err(|error| match error {
+                ExceedsMaxSupportedPublishers => LinkError::Taken { service: self.name.clone(), role },
+                other => LinkError::Service { service: self.name.clone(), reason: format!("{other:?}") },
+            })?;
+        let notifier = self.event.notifier_builder().create().map_err(|error| LinkError::Service {
+            service: self.name.clone(),
+            reason: format!("{error:?}"),
+        })?;
+        Ok(Sender { publisher, notifier })
+    }
+
+    pub(super) fn receiver(&self) -> Result<Receiver<T>, LinkError> {
+        let failed = |reason: String| LinkError::Service { service: self.name.clone(), reason };
+        let subscriber =
+            self.data.subscriber_builder().create().map_err(|error| failed(format!("{error:?}")))?;
+        let listener =
+            self.event.listener_builder().create().map_err(|error| failed(format!("{error:?}")))?;
+        Ok(Receiver { subscriber, listener, pending: Cell::default() })
+    }
+}
+
+pub(super) struct Sender<T: ZeroCopySend + std::fmt::Debug + 'static> {
+    pub(super) publisher: Publisher<Ipc, T, ()>,
+    notifier: Notifier<Ipc>,
+}
+
+impl<T: ZeroCopySend + std::fmt::Debug + 'static> Sender<T> {
+    pub(super) fn notify(&self, event: usize) -> Result<(), LinkError> {
+        self.notifier
+            .notify_with_custom_event_id(EventId::new(event))
+            .map(drop)
+            .map_err(traffic("waking the peer"))
+    }
+}
+
+pub(super) struct Receiver<T: ZeroCopySend + std::fmt::Debug + 'static> {
+    subscriber: Subscriber<Ipc, T, ()>,
+    listener: Listener<Ipc>,
+    /// Signals that came with a message and were not yet acted upon.
+    pending: Cell<Events>,
+}
+
+impl<T: ZeroCopySend + std::fmt::Debug + 'static> Receiver<T> {
+    pub(super) fn poll(&self) -> Result<Option<Received<T>>, LinkError> {
+        self.subscriber.receive().map_err(traffic("receiving"))
+    }
+
+    /// Takes the signals seen so far, without blocking; an event service must be drained, or every later wait returns at
+    /// once.
+    pub(super) fn take_events(&self) -> Result<Events, LinkError> {
+        self.note_events(|note| self.listener.try_wait(note))?;
+        Ok(self.pending.take())
+    }
+
+    /// Waits for a message. A message wins over signals that came with it: those are kept for the next call.
+    pub(super) fn wait(
+        &self,
+        spin: Duration,
+        timeout: Duration,
+    ) -> Result<(Wait<Received<T>>, Events), LinkError> {
+        let start = Instant::now();
+        while start.elapsed() < spin.min(timeout) {
+            if let Some(sample) = self.poll()? {
+                return Ok((Wait::Message(sample), Events::default()));
+            }
+            std::hint::spin_loop();
+        }
+        loop {
+            if let Some(sample) = self.poll()? {
+                return Ok((Wait::Message(sample), Events::default()));
+            }
+            if self.pending.get().closed {
+                return Ok((Wait::Closed, self.pending.take()));
+            }
+            let left = timeout.saturating_sub(start.elapsed());
+            if left.is_zero() || self.pending.get().hello {
+                return Ok((Wait::TimedOut, self.pending.take()));
+            }
+            self.note_events(|note| self.listener.timed_wait(note, left))?;
+        }
+    }
+
+    fn note_events(
+        &self,
+        collect: impl FnOnce(&mut dyn FnMut(EventActivation)) -> Result<u64, ListenerWaitError>,
+    ) -> Result<(), LinkError> {
+        let mut events = self.pending.get();
+        collect(&mut |event| events.note(event.id)).map_err(traffic("waiting for the peer"))?;
+        self.pending.set(events);
+        Ok(())
+    }
+}
+
+impl Events {
+    fn note(&mut self, id: EventId) {
+        match id.as_value() {
+            EVENT_HELLO => self.hello = true,
+            EVENT_CLOSED => self.closed = true,
+            _ => {}
+        }
+    }
+}
