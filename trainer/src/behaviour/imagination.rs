@@ -1,0 +1,64 @@
+use candle_core::{Result, Tensor};
+
+use super::{Horizon, lambda_return, step_weights};
+use crate::model::agent::Agent;
+use crate::model::latent::{Sampler, State};
+
+/// What the policy does in the model, from N starts over L states; every tensor [L, N, ...] unless it says otherwise.
+#[derive(Debug, Clone)]
+pub struct Imagination {
+    /// States s_t, the start first: [L, N, state width].
+    pub features: Tensor,
+    /// The action taken in each state: [L, N, action].
+    pub actions: Tensor,
+    /// Predicted reward of each state: [L, N, 1].
+    pub reward: Tensor,
+    /// The critic's value of each state: [L, N, 1].
+    pub value: Tensor,
+    /// gamma times the predicted continuation: [L, N, 1].
+    pub discount: Tensor,
+    /// How much of a state is still reached: [L, N, 1], without gradient.
+    pub weights: Tensor,
+    /// Returns of the first L - 1 states: [L-1, N, 1] (eq. 10).
+    pub returns: Tensor,
+}
+
+/// Imagines from every row of `start` [N, ...] with the actor choosing. Gradients flow from states and actions back
+/// through the dynamics, but not into the actor's input.
+///
+/// # Errors
+/// Those of candle.
+pub fn imagine(
+    agent: &Agent,
+    start: &State,
+    horizon: &Horizon,
+    sampler: &mut Sampler,
+) -> Result<Imagination> {
+    let mut features = Vec::with_capacity(horizon.length);
+    let mut actions = Vec::with_capacity(horizon.length);
+    let mut state = start.clone();
+    for step in 0..horizon.length {
+        let seen = state.features()?;
+        let action = agent.actor.forward(&seen.detach())?.sample(sampler)?;
+        if step + 1 < horizon.length {
+            state = agent.world.imagine_step(&state, &action, sampler)?;
+        }
+        features.push(seen);
+        actions.push(action);
+    }
+    let features = Tensor::stack(&features, 0)?; // [L, N, state width]
+    let reward = agent.heads.reward.mean(&agent.heads.reward.logits(&features)?)?;
+    let value = agent.critic.mean(&agent.critic.logits(&features)?)?;
+    let discount = (agent.heads.continue_probability(&features)? * horizon.discount)?;
+    let weights = step_weights(&discount)?;
+    let returns = lambda_return(&reward, &value, &discount, horizon.lambda)?;
+    Ok(Imagination {
+        features,
+        actions: Tensor::stack(&actions, 0)?,
+        reward,
+        value,
+        discount,
+        weights,
+        returns,
+    })
+}

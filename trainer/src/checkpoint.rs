@@ -1,0 +1,214 @@
+//! A checkpoint: a folder with the weights and the settings they were made with.
+//!
+//! ```text
+//! checkpoint.toml               format, sizes, preset, seed, updates, sha256 of the weights
+//! weights-<sha256>.safetensors  every parameter by name, f32; the name holds the checksum's first 16 digits
+//! ```
+//!
+//! Both files are written whole or not at all, the settings last, and only then are older weights removed: whenever the writer
+//! dies, the folder holds a whole checkpoint, the old one or the new one.
+
+use std::collections::BTreeMap;
+use std::fs;
+use std::path::{Path, PathBuf};
+
+use candle_core::{Device, Tensor};
+use rcwm_models::files::{FileError, read_capped, sha256_hex, write_atomic};
+use rcwm_models::settings::{ModelSettings, SettingsError};
+use safetensors::{Dtype, SafeTensors, tensor::TensorView};
+use serde::{Deserialize, Serialize};
+
+use crate::model::agent;
+use crate::model::parameters::{ParameterError, Parameters};
+
+/// File name of the settings.
+pub const SETTINGS_FILE: &str = "checkpoint.toml";
+/// Version of the checkpoint format.
+pub const FORMAT: u32 = 1;
+/// Largest file of weights accepted, in bytes; the paper's has about 100 MB.
+const WEIGHTS_BYTES_MAX: u64 = 4 << 30;
+
+/// Why a checkpoint could not be written or was refused.
+#[derive(Debug, thiserror::Error)]
+pub enum CheckpointError {
+    /// A file is missing, unreadable, too large or a link.
+    #[error("checkpoint: {0}")]
+    File(#[from] FileError),
+    /// The folder could not be made.
+    #[error("checkpoint: {path}: {source}")]
+    Folder {
+        /// The folder.
+        path: PathBuf,
+        /// What the operating system said.
+        source: std::io::Error,
+    },
+    /// The folder holds a checkpoint already.
+    #[error("checkpoint: {path} holds a checkpoint already; choose another folder or say --force")]
+    Exists {
+        /// The folder.
+        path: PathBuf,
+    },
+    /// The settings are unusable.
+    #[error("checkpoint: {0}")]
+    Settings(#[from] SettingsError),
+    /// The settings could not be written as TOML.
+    #[error("checkpoint: {0}")]
+    Serialize(#[from] toml::ser::Error),
+    /// It was written by another version.
+    #[error("checkpoint: format {found}, this program reads format {FORMAT}; use the trainer that wrote it")]
+    Format {
+        /// The format found.
+        found: u32,
+    },
+    /// The weights are not those that were written with the settings.
+    #[error("checkpoint: {file} has sha256 {found}, {SETTINGS_FILE} says {expected}; use another checkpoint")]
+    Checksum {
+        /// The weights.
+        file: String,
+        /// The checksum found.
+        found: String,
+        /// The checksum expected.
+        expected: String,
+    },
+    /// The settings' checksum is none.
+    #[error("checkpoint: {SETTINGS_FILE}: weights_sha256 = {found:?}, expected 64 hexadecimal digits")]
+    NotADigest {
+        /// What was found.
+        found: String,
+    },
+    /// The weights are no readable safetensors file.
+    #[error("checkpoint: the weights are not a readable safetensors file: {0}")]
+    Weights(#[from] safetensors::SafeTensorError),
+    /// A parameter is not f32.
+    #[error("checkpoint: parameter {name} has type {found}, expected F32")]
+    DType {
+        /// The parameter.
+        name: String,
+        /// Its type.
+        found: String,
+    },
+    /// The weights do not fit the settings.
+    #[error("checkpoint: {0}")]
+    Parameters(#[from] ParameterError),
+    /// A tensor operation failed.
+    #[error("checkpoint: {0}")]
+    Tensor(#[from] candle_core::Error),
+}
+
+/// `checkpoint.toml`.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct CheckpointSettings {
+    /// [`FORMAT`].
+    pub format: u32,
+    /// `debug`, `small`, `paper` or `custom`.
+    pub preset: String,
+    /// Seed of the first weights.
+    pub seed: u64,
+    /// World-model updates behind the weights.
+    pub updates: u64,
+    /// What it was trained on, in words.
+    pub data: String,
+    /// sha256 of the weights' file, lower-case hexadecimal; empty only before it is written.
+    pub weights_sha256: String,
+    /// The sizes.
+    pub model: ModelSettings,
+}
+
+/// Weights with their settings.
+#[derive(Debug, Clone)]
+pub struct Checkpoint {
+    /// What is known about the weights.
+    pub settings: CheckpointSettings,
+    /// The weights.
+    pub parameters: Parameters,
+}
+
+impl Checkpoint {
+    /// Writes the checkpoint into `folder`, which is made if it is not there.
+    ///
+    /// # Errors
+    /// See [`CheckpointError`]; a checkpoint that was there before stays readable unless both new files were written.
+    pub fn write(&self, folder: &Path) -> Result<(), CheckpointError> {
+        fs::create_dir_all(folder)
+            .map_err(|source| CheckpointError::Folder { path: folder.to_path_buf(), source })?;
+        let weights = weights_to_bytes(&self.parameters)?;
+        let settings = CheckpointSettings { weights_sha256: sha256_hex(&weights), ..self.settings.clone() };
+        let weights_file = weights_file(&settings.weights_sha256);
+        let text = toml::to_string(&settings)?;
+        write_atomic(&folder.join(&weights_file), &weights)?;
+        write_atomic(&folder.join(SETTINGS_FILE), text.as_bytes())?;
+        remove_other_weights(folder, &weights_file)
+            .map_err(|source| CheckpointError::Folder { path: folder.to_path_buf(), source })
+    }
+
+    /// Reads a checkpoint: exactly the parameters that its settings ask for, of their shapes, all finite.
+    ///
+    /// # Errors
+    /// See [`CheckpointError`].
+    pub fn read(folder: &Path, device: &Device) -> Result<Self, CheckpointError> {
+        let settings: CheckpointSettings = rcwm_models::settings::read(&folder.join(SETTINGS_FILE))?;
+        if settings.format != FORMAT {
+            return Err(CheckpointError::Format { found: settings.format });
+        }
+        settings.model.validate()?;
+        let is_digest = settings.weights_sha256.bytes().all(|byte| byte.is_ascii_hexdigit());
+        if settings.weights_sha256.len() != 64 || !is_digest {
+            let found = settings.weights_sha256;
+            return Err(CheckpointError::NotADigest { found });
+        }
+        let file = weights_file(&settings.weights_sha256);
+        let bytes = read_capped(&folder.join(&file), WEIGHTS_BYTES_MAX)?;
+        let found = sha256_hex(&bytes);
+        if found != settings.weights_sha256 {
+            return Err(CheckpointError::Checksum { file, found, expected: settings.weights_sha256 });
+        }
+        let tensors = weights_from_bytes(&bytes)?;
+        let parameters = Parameters::from_tensors(&agent::specs(&settings.model)?, tensors, device)?;
+        Ok(Self { settings, parameters })
+    }
+}
+
+/// The name of the file with these weights.
+fn weights_file(sha256: &str) -> String {
+    format!("weights-{}.safetensors", &sha256[..16])
+}
+
+fn remove_other_weights(folder: &Path, keep: &str) -> std::io::Result<()> {
+    for entry in fs::read_dir(folder)? {
+        let entry = entry?;
+        let name = entry.file_name();
+        let name = name.to_string_lossy();
+        if name.starts_with("weights-") && name.ends_with(".safetensors") && name != keep {
+            fs::remove_file(entry.path())?;
+        }
+    }
+    Ok(())
+}
+
+fn weights_to_bytes(parameters: &Parameters) -> Result<Vec<u8>, CheckpointError> {
+    let host = |(name, var): (&str, &candle_core::Var)| {
+        let values = var.flatten_all()?.to_vec1::<f32>()?;
+        let bytes: Vec<u8> = values.iter().flat_map(|value| value.to_le_bytes()).collect();
+        Ok((name.to_owned(), var.dims().to_vec(), bytes))
+    };
+    let arrays = parameters.iter().map(host).collect::<Result<Vec<_>, CheckpointError>>()?;
+    let views = arrays
+        .iter()
+        .map(|(name, shape, bytes)| Ok((name, TensorView::new(Dtype::F32, shape.clone(), bytes)?)))
+        .collect::<Result<Vec<_>, CheckpointError>>()?;
+    Ok(safetensors::serialize(views, None)?)
+}
+
+fn weights_from_bytes(bytes: &[u8]) -> Result<BTreeMap<String, Tensor>, CheckpointError> {
+    let mut tensors = BTreeMap::new();
+    for (name, view) in SafeTensors::deserialize(bytes)?.tensors() {
+        if view.dtype() != Dtype::F32 {
+            return Err(CheckpointError::DType { found: format!("{:?}", view.dtype()), name });
+        }
+        let values: Vec<f32> =
+            view.data().as_chunks::<4>().0.iter().map(|word| f32::from_le_bytes(*word)).collect();
+        tensors.insert(name, Tensor::from_vec(values, view.shape(), &Device::Cpu)?);
+    }
+    Ok(tensors)
+}

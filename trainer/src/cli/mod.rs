@@ -1,0 +1,118 @@
+//! The command line, one file per verb.
+
+mod init;
+mod parameters;
+mod parity;
+
+use std::path::Path;
+use std::process::ExitCode;
+
+use anyhow::{Context, Result};
+use candle_core::Device;
+use clap::{Parser, Subcommand, ValueEnum};
+use rcwm_models::settings::{self, ModelKind, ModelSettings, Preset};
+
+/// Learns the Robo-Centric World Model and exports it.
+#[derive(Debug, Parser)]
+#[command(name = "rcwm-trainer", version, about, max_term_width = 110)]
+pub struct Arguments {
+    #[command(subcommand)]
+    verb: Verb,
+}
+
+#[derive(Debug, Subcommand)]
+enum Verb {
+    Parameters(parameters::Parameters),
+    Parity(parity::Parity),
+    Init(init::Init),
+}
+
+impl Arguments {
+    /// Runs the verb.
+    pub fn run(self) -> Result<ExitCode> {
+        match self.verb {
+            Verb::Parameters(verb) => verb.run(),
+            Verb::Parity(verb) => verb.run(),
+            Verb::Init(verb) => verb.run(),
+        }
+    }
+}
+
+#[derive(Debug, Clone, Copy, ValueEnum)]
+enum PresetName {
+    /// Runs every code path in milliseconds.
+    Debug,
+    /// Trains on two CPU cores.
+    Small,
+    /// The paper's.
+    Paper,
+}
+
+#[derive(Debug, Clone, Copy, ValueEnum)]
+enum ModelName {
+    /// Robot and environment branch with interaction.
+    Rcwm,
+    /// One branch: the DreamerV3 baseline.
+    Vanilla,
+}
+
+/// Which model, of which sizes.
+#[derive(Debug, clap::Args)]
+struct ModelArguments {
+    /// Sizes to start from
+    #[arg(long, value_enum, default_value = "small")]
+    preset: PresetName,
+    /// Which world model
+    #[arg(long, value_enum, default_value = "rcwm")]
+    model: ModelName,
+    /// Change one setting, for example --set cnn_depth=16 (repeatable)
+    #[arg(long = "set", value_name = "KEY=VALUE")]
+    overrides: Vec<String>,
+}
+
+impl ModelArguments {
+    /// The resolved sizes.
+    fn settings(&self) -> Result<ModelSettings> {
+        let preset = match self.preset {
+            PresetName::Debug => Preset::Debug,
+            PresetName::Small => Preset::Small,
+            PresetName::Paper => Preset::Paper,
+        };
+        let kind = match self.model {
+            ModelName::Rcwm => ModelKind::Rcwm,
+            ModelName::Vanilla => ModelKind::Vanilla,
+        };
+        let resolved = settings::with_overrides(&ModelSettings::preset(preset, kind), &self.overrides)?;
+        resolved.validate()?;
+        Ok(resolved)
+    }
+
+    /// The preset's name, or `custom` where it was changed.
+    fn name(&self) -> String {
+        if !self.overrides.is_empty() {
+            return "custom".to_owned();
+        }
+        self.preset.to_possible_value().map_or_else(String::new, |value| value.get_name().to_owned())
+    }
+}
+
+/// `cpu`, or `cuda` or `cuda:N` in a build with the feature `cuda`.
+fn parse_device(text: &str) -> Result<Device> {
+    match text.split_once(':').unwrap_or((text, "0")) {
+        ("cpu", _) => Ok(Device::Cpu),
+        ("cuda", index) => {
+            let index = index.parse().with_context(|| format!("--device {text}: expected cuda:N"))?;
+            Device::new_cuda(index).with_context(|| {
+                format!("--device {text}: needs a CUDA device and a build with --features cuda")
+            })
+        }
+        _ => anyhow::bail!("--device {text}: expected cpu, cuda or cuda:N"),
+    }
+}
+
+/// Writes what a verb measured as JSON.
+fn write_json(path: &Path, value: &impl serde::Serialize) -> Result<()> {
+    let mut text = serde_json::to_vec_pretty(value)?;
+    text.push(b'\n');
+    rcwm_models::files::write_atomic(path, &text).with_context(|| format!("--json {}", path.display()))
+}

@@ -1,0 +1,73 @@
+use std::path::PathBuf;
+use std::process::ExitCode;
+
+use anyhow::Result;
+use rcwm_trainer::parity::{self, Group, Report};
+use serde::Serialize;
+
+/// Compare our model with a reference file of the authors' implementation; exit 1 beyond tolerance
+#[derive(Debug, clap::Args)]
+#[command(after_help = "Examples:
+  rcwm-trainer parity tests/data/rcwm-small.safetensors
+  rcwm-trainer parity tests/data/rcwm-small.safetensors --group observe --group imagine --json parity.json")]
+pub struct Parity {
+    /// The reference file
+    file: PathBuf,
+    /// Compare this group only (repeatable); all by default
+    #[arg(long = "group", value_enum, value_name = "NAME")]
+    groups: Vec<Group>,
+    /// Where to compute: cpu, cuda or cuda:N
+    #[arg(long, default_value = "cpu")]
+    device: String,
+    /// Write every tensor's error as JSON
+    #[arg(long, value_name = "FILE")]
+    json: Option<PathBuf>,
+}
+
+#[derive(Serialize)]
+struct Outcome<'a> {
+    file: &'a PathBuf,
+    passes: bool,
+    #[serde(flatten)]
+    report: &'a Report,
+}
+
+impl Parity {
+    pub fn run(self) -> Result<ExitCode> {
+        let groups = if self.groups.is_empty() { Group::ALL.to_vec() } else { self.groups.clone() };
+        let report = parity::check_file(&self.file, &groups, &super::parse_device(&self.device)?)?;
+        print(&report);
+        if let Some(path) = &self.json {
+            super::write_json(path, &Outcome { file: &self.file, passes: report.passes(), report: &report })?;
+        }
+        Ok(if report.passes() { ExitCode::SUCCESS } else { ExitCode::FAILURE })
+    }
+}
+
+fn print(report: &Report) {
+    println!("{:<17} {:>7} {:>10} {:>10}         worst tensor", "group", "tensors", "max error", "tolerance");
+    for group in &report.groups {
+        let worst = group.worst();
+        println!(
+            "{:<17} {:>7} {:>10.2e} {:>10.0e}  {:<5}  {}",
+            group.group.as_str(),
+            group.comparisons.len(),
+            worst.map_or(f32::NAN, |worst| worst.error_max),
+            group.tolerance,
+            if group.passes() { "ok" } else { "FAIL" },
+            worst.map_or("", |worst| worst.name.as_str()),
+        );
+    }
+    for unchecked in &report.unchecked {
+        println!("{:<17} {:>7} not checked", unchecked.prefix, unchecked.tensors);
+    }
+    let failed = report.groups.iter().filter(|group| !group.passes()).count();
+    let left: usize = report.unchecked.iter().map(|unchecked| unchecked.tensors).sum();
+    match failed {
+        0 => println!(
+            "all {} groups within tolerance; {left} tensors of the file not checked",
+            report.groups.len()
+        ),
+        _ => println!("{failed} of {} groups beyond tolerance", report.groups.len()),
+    }
+}

@@ -1,0 +1,17 @@
+//! `rcwm-trainer`: learns the Robo-Centric World Model and exports it.
+
+mod cli;
+
+use std::process::ExitCode;
+
+use clap::Parser;
+
+fn main() -> ExitCode {
+    match cli::Arguments::parse().run() {
+        Ok(code) => code,
+        Err(error) => {
+            eprintln!("rcwm-trainer: {error:#}");
+            ExitCode::FAILURE
+        }
+    }
+}

@@ -1,0 +1,137 @@
+//! The recurrent part that robot, environment and the vanilla baseline have alike (eq. 5, 6).
+
+use candle_core::{D, Result, Tensor};
+use rcwm_models::settings::ModelSettings;
+
+use super::init::Init;
+use super::latent::{Latent, Sampler};
+use super::layers::{Dense, Linear, NORM_EPS, Norm};
+use super::parameters::{Built, Scope};
+use crate::ops;
+
+/// A dense block and the logits of n categoricals of m classes.
+#[derive(Debug, Clone)]
+struct LatentHead {
+    dense: Dense,
+    logits: Linear,
+}
+
+impl LatentHead {
+    fn new(scope: &Scope<'_>, input: usize, settings: &ModelSettings) -> Built<Self> {
+        let dense = Dense::new(&scope.at("dense"), input, settings.hidden)?;
+        let logits = Linear::output(&scope.at("logits"), settings.hidden, settings.stoch_width(), 1.0)?;
+        Ok(Self { dense, logits })
+    }
+}
+
+/// One branch: input layer, recurrent cell, prior and posterior, learned initial state.
+#[derive(Debug, Clone)]
+pub struct Branch {
+    input: Dense,
+    cell_weight: Tensor,
+    cell_norm: Norm,
+    prior: LatentHead,
+    posterior: LatentHead,
+    initial: Tensor,
+    categoricals: usize,
+    classes: usize,
+    unimix: f64,
+}
+
+impl Branch {
+    /// A branch whose input layer takes `input` values and whose posterior takes `embed` values of the image.
+    ///
+    /// # Errors
+    /// Those of [`Scope::get`].
+    pub fn new(scope: &Scope<'_>, settings: &ModelSettings, input: usize, embed: usize) -> Built<Self> {
+        let (d, hidden) = (settings.deter, settings.hidden);
+        let cell = scope.at("cell");
+        let init = Init::TruncatedNormal { fans: hidden + d + 3 * d };
+        Ok(Self {
+            input: Dense::new(&scope.at("input"), input, hidden)?,
+            cell_weight: cell.at("linear").get("weight", &[3 * d, hidden + d], init)?,
+            cell_norm: Norm::new(&cell.at("norm"), 3 * d, NORM_EPS)?,
+            prior: LatentHead::new(&scope.at("prior"), d, settings)?,
+            posterior: LatentHead::new(&scope.at("posterior"), d + embed, settings)?,
+            initial: scope.get("initial", &[1, d], Init::Zeros)?,
+            categoricals: settings.categoricals,
+            classes: settings.classes,
+            unimix: settings.unimix,
+        })
+    }
+
+    /// The learned state an episode starts from: `h_0 = tanh(w)`, `z_0` = mode of the prior at `h_0`; every tensor [B, ...].
+    ///
+    /// # Errors
+    /// Those of candle.
+    pub fn initial(&self, batch: usize) -> Result<Latent> {
+        let h = self.initial.tanh()?; // [1, d]
+        let logits = self.prior_logits(&h)?; // [1, n, m]
+        let z = ops::straight_through_mode(&logits, self.unimix)?;
+        let repeat = |x: &Tensor| {
+            let mut shape = x.dims().to_vec();
+            shape[0] = batch;
+            x.broadcast_as(shape)
+        };
+        Ok(Latent { z: repeat(&z)?, h: repeat(&h)?, logits: repeat(&logits)? })
+    }
+
+    /// One step of the recurrence (eq. 5, 6): `x` [B, input] and `h` [B, d] to h' [B, d].
+    ///
+    /// # Errors
+    /// Those of candle.
+    pub fn recur(&self, x: &Tensor, h: &Tensor) -> Result<Tensor> {
+        let x = self.input.forward(x)?; // [B, hidden]
+        let gates = ops::linear(&Tensor::cat(&[&x, h], D::Minus1)?, &self.cell_weight, None)?; // [B, 3d]
+        ops::recurrent_update(&self.cell_norm.forward(&gates)?, h)
+    }
+
+    /// Logits of the prior `p(z_t | h_t)`: `h` [..., d] to [..., n, m].
+    ///
+    /// # Errors
+    /// Those of candle.
+    pub fn prior_logits(&self, h: &Tensor) -> Result<Tensor> {
+        self.to_latent_shape(&self.prior.logits.forward(&self.prior.dense.forward(h)?)?)
+    }
+
+    /// The image's share in the posterior's dense block: `embed` [..., E] to [..., hidden]. It does not depend on the
+    /// recurrence, so a whole sequence is done at once.
+    ///
+    /// # Errors
+    /// Those of candle.
+    pub fn embed_share(&self, embed: &Tensor) -> Result<Tensor> {
+        self.posterior.dense.partial(embed, self.initial.dim(1)?)
+    }
+
+    /// Logits of the posterior `q(z_t | h_t, o_t)`: `h` [..., d] and the image's share [..., hidden] to [..., n, m].
+    ///
+    /// # Errors
+    /// Those of candle.
+    pub fn posterior_logits(&self, h: &Tensor, embed_share: &Tensor) -> Result<Tensor> {
+        let hidden = self.posterior.dense.finish(&(self.posterior.dense.partial(h, 0)? + embed_share)?)?;
+        self.to_latent_shape(&self.posterior.logits.forward(&hidden)?)
+    }
+
+    /// A latent drawn from `logits` [..., n, m].
+    ///
+    /// # Errors
+    /// Those of candle.
+    pub fn draw(&self, logits: Tensor, h: &Tensor, sampler: &mut Sampler) -> Result<Latent> {
+        let gumbel = sampler.gumbel(logits.dims(), logits.device())?;
+        self.draw_with(logits, h, gumbel.as_ref())
+    }
+
+    /// A latent drawn with given Gumbel noise (none: the mode).
+    ///
+    /// # Errors
+    /// Those of candle.
+    pub fn draw_with(&self, logits: Tensor, h: &Tensor, gumbel: Option<&Tensor>) -> Result<Latent> {
+        let z = ops::straight_through_sample(&logits, self.unimix, gumbel)?;
+        Ok(Latent { z, h: h.clone(), logits })
+    }
+
+    fn to_latent_shape(&self, logits: &Tensor) -> Result<Tensor> {
+        let lead = &logits.dims()[..logits.rank() - 1];
+        logits.reshape([lead, &[self.categoricals, self.classes]].concat())
+    }
+}

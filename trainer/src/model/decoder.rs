@@ -1,0 +1,77 @@
+//! Latent state to image and mask.
+
+use candle_core::{D, Result, Tensor};
+
+use super::encoder::KERNEL_AREA;
+use super::init::Init;
+use super::layers::{Linear, NORM_EPS, Norm};
+use super::parameters::{Built, Scope};
+use crate::ops;
+
+/// What one decoder paints.
+#[derive(Debug, Clone)]
+pub struct Picture {
+    /// [..., 64, 64, 3], in the range of `x/255 - 0.5`.
+    pub image: Tensor,
+    /// [..., 64, 64, 1], in (0, 1): how much of a pixel is this branch's.
+    pub mask: Tensor,
+}
+
+impl Picture {
+    /// The image times the mask: this branch's contribution to the whole picture.
+    ///
+    /// # Errors
+    /// Those of candle.
+    pub fn masked(&self) -> Result<Tensor> {
+        self.image.broadcast_mul(&self.mask)
+    }
+}
+
+/// A linear layer to 4x4 pixels of 8c channels and four transposed convolutions to 64x64: three image channels and a
+/// mask logit.
+#[derive(Debug, Clone)]
+pub struct Decoder {
+    linear: Linear,
+    hidden: Vec<(Tensor, Norm)>,
+    last: (Tensor, Tensor),
+    channels: usize,
+}
+
+impl Decoder {
+    /// `linear.*`, `0` to `2` `.conv.weight` and `.norm.*`, `3.conv.*`.
+    ///
+    /// # Errors
+    /// Those of [`Scope::get`].
+    pub fn new(scope: &Scope<'_>, state: usize, depth: usize) -> Built<Self> {
+        let channels = 8 * depth;
+        let linear = Linear::output(&scope.at("linear"), state, 16 * channels, 1.0)?;
+        let mut hidden = Vec::with_capacity(3);
+        for index in 0..3 {
+            let (input, out) = (channels >> index, channels >> (index + 1));
+            let init = Init::TruncatedNormal { fans: KERNEL_AREA * (input + out) };
+            let scope = scope.at(index);
+            let weight = scope.at("conv").get("weight", &[input, out, 4, 4], init)?;
+            hidden.push((weight, Norm::new(&scope.at("norm"), out, NORM_EPS)?));
+        }
+        let init = Init::Uniform { fans: KERNEL_AREA * (depth + 4), scale: 1.0 };
+        let last = scope.at(3).at("conv");
+        let last = (last.get("weight", &[depth, 4, 4, 4], init)?, last.get("bias", &[4], Init::Zeros)?);
+        Ok(Self { linear, hidden, last, channels })
+    }
+
+    /// `state` [..., n*m + d] to a picture.
+    ///
+    /// # Errors
+    /// Those of candle.
+    pub fn forward(&self, state: &Tensor) -> Result<Picture> {
+        let lead = &state.dims()[..state.rank() - 1];
+        let x = self.linear.forward(state)?.reshape(((), 4, 4, self.channels))?; // [N, 4, 4, 8c]
+        let x = self.hidden.iter().try_fold(x, |x, (weight, norm)| norm.silu(&ops::conv_up(&x, weight)?))?; // [N, 32, 32, c]
+        let (weight, bias) = &self.last;
+        let x = ops::conv_up(&x, weight)?.broadcast_add(bias)?; // [N, 64, 64, 4]
+        let shape = [lead, &x.dims()[1..]].concat();
+        let x = x.reshape(shape)?;
+        let image = x.narrow(D::Minus1, 0, 3)?;
+        Ok(Picture { image, mask: ops::sigmoid(&x.narrow(D::Minus1, 3, 1)?)? })
+    }
+}

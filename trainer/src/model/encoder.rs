@@ -1,0 +1,60 @@
+//! Images to features to embeddings.
+
+use candle_core::{DType, Result, Tensor};
+
+use super::init::Init;
+use super::layers::{NORM_EPS, Norm};
+use super::parameters::{Built, Scope};
+use crate::ops;
+
+/// Kernel area of every convolution.
+pub(super) const KERNEL_AREA: usize = 16;
+
+/// `x/255 - 0.5` of a u8 image, as f32; channels last.
+///
+/// # Errors
+/// Those of candle.
+pub fn image_to_float(image: &Tensor) -> Result<Tensor> {
+    // A division, not a product with the inverse: the last bit then agrees with other implementations.
+    let full = Tensor::new(255f32, image.device())?;
+    image.to_dtype(DType::F32)?.broadcast_div(&full)? - 0.5
+}
+
+/// Convolutions that halve the sides, each with LayerNorm over channels and `SiLU`.
+#[derive(Debug, Clone)]
+pub struct ConvStack {
+    layers: Vec<(Tensor, Norm)>,
+}
+
+impl ConvStack {
+    /// One layer for each step of `channels`: `i.conv.weight`, `i.norm.*`.
+    ///
+    /// # Errors
+    /// Those of [`Scope::get`].
+    pub fn new(scope: &Scope<'_>, channels: &[usize]) -> Built<Self> {
+        let layer = |(index, step): (usize, &[usize])| {
+            let (input, out) = (step[0], step[1]);
+            let init = Init::TruncatedNormal { fans: KERNEL_AREA * (input + out) };
+            let scope = scope.at(index);
+            let weight = scope.at("conv").get("weight", &[out, input, 4, 4], init)?;
+            Ok((weight, Norm::new(&scope.at("norm"), out, NORM_EPS)?))
+        };
+        Ok(Self { layers: channels.windows(2).enumerate().map(layer).collect::<Built<_>>()? })
+    }
+
+    /// `x` [N, H, W, first channels] to [N, H/2^layers, W/2^layers, last channels].
+    ///
+    /// # Errors
+    /// Those of candle.
+    pub fn forward(&self, x: &Tensor) -> Result<Tensor> {
+        self.layers.iter().try_fold(x.clone(), |x, (weight, norm)| norm.silu(&ops::conv_down(&x, weight)?))
+    }
+}
+
+/// Flattens [N, 4, 4, C] in (channel, row, column) order, as the posterior's weights expect it: [N, 16 C].
+///
+/// # Errors
+/// Those of candle.
+pub fn flatten_channels_first(x: &Tensor) -> Result<Tensor> {
+    x.permute((0, 3, 1, 2))?.flatten_from(1)
+}

@@ -1,0 +1,261 @@
+//! Latent states, where episodes begin in them, and the noise that draws them.
+
+use candle_core::{D, Device, Result, Tensor};
+use rand::{Rng, SeedableRng};
+use rand_chacha::ChaCha8Rng;
+use rand_distr::{Gumbel, StandardNormal};
+
+/// One branch's latent state s = [z, h], with the logits its z came from.
+#[derive(Debug, Clone)]
+pub struct Latent {
+    /// One-hot rows [..., n, m], with a gradient.
+    pub z: Tensor,
+    /// Deterministic state [..., d].
+    pub h: Tensor,
+    /// Logits of z, before the uniform share is mixed in: [..., n, m].
+    pub logits: Tensor,
+}
+
+impl Latent {
+    /// `[z, h]`: [..., n*m + d].
+    ///
+    /// # Errors
+    /// Those of candle.
+    pub fn features(&self) -> Result<Tensor> {
+        Tensor::cat(&[&self.z.flatten_from(self.z.rank() - 2)?, &self.h], D::Minus1)
+    }
+
+    /// Applies the same operation to z, h and logits.
+    ///
+    /// # Errors
+    /// Those of `op`.
+    pub fn map(&self, op: impl Fn(&Tensor) -> Result<Tensor>) -> Result<Self> {
+        Ok(Self { z: op(&self.z)?, h: op(&self.h)?, logits: op(&self.logits)? })
+    }
+
+    /// Latents side by side along a new dimension.
+    ///
+    /// # Errors
+    /// Those of candle.
+    pub fn stack<'a>(latents: impl Iterator<Item = &'a Self>, dim: usize) -> Result<Self> {
+        let latents: Vec<_> = latents.collect();
+        let stack = |field: fn(&Self) -> &Tensor| {
+            Tensor::stack(&latents.iter().map(|latent| field(latent)).collect::<Vec<_>>(), dim)
+        };
+        Ok(Self { z: stack(|l| &l.z)?, h: stack(|l| &l.h)?, logits: stack(|l| &l.logits)? })
+    }
+}
+
+/// The latent state of a whole model: robot and environment, or the one branch of the vanilla baseline.
+#[derive(Debug, Clone)]
+pub struct State {
+    /// The branches, the robot's first.
+    pub branches: Vec<Latent>,
+}
+
+impl State {
+    /// `s = [z^R, h^R, z^E, h^E]`: [..., state width].
+    ///
+    /// # Errors
+    /// Those of candle.
+    pub fn features(&self) -> Result<Tensor> {
+        let branches = self.branches.iter().map(Latent::features).collect::<Result<Vec<_>>>()?;
+        Tensor::cat(&branches, D::Minus1)
+    }
+
+    /// Applies the same operation to every tensor.
+    ///
+    /// # Errors
+    /// Those of `op`.
+    pub fn map(&self, op: impl Fn(&Tensor) -> Result<Tensor>) -> Result<Self> {
+        let branches = self.branches.iter().map(|branch| branch.map(&op)).collect::<Result<_>>()?;
+        Ok(Self { branches })
+    }
+
+    /// States side by side along a new dimension.
+    ///
+    /// # Errors
+    /// Those of candle.
+    pub fn stack(states: &[Self], dim: usize) -> Result<Self> {
+        let branches = states.first().map_or(0, |state| state.branches.len());
+        let stack = |index: usize| Latent::stack(states.iter().map(|state| &state.branches[index]), dim);
+        Ok(Self { branches: (0..branches).map(stack).collect::<Result<_>>()? })
+    }
+}
+
+/// Which steps of a batch begin an episode. Known on the host, so that steps without a beginning cost nothing.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub struct FirstSteps {
+    flags: Vec<bool>,
+    length: usize,
+}
+
+/// How the carried state of one step is made.
+#[derive(Debug)]
+pub enum Carry {
+    /// Every row goes on.
+    All,
+    /// Every row begins.
+    None,
+    /// 1 where the row begins, 0 where it goes on: [B, 1].
+    Some(Tensor),
+}
+
+impl FirstSteps {
+    /// `flags` by row, then step: [B, T].
+    ///
+    /// # Panics
+    /// If `flags` is no whole number of rows of `length`; a programming error.
+    #[must_use]
+    pub fn new(flags: Vec<bool>, length: usize) -> Self {
+        assert!(length > 0 && flags.len().is_multiple_of(length), "flags must be whole rows");
+        Self { flags, length }
+    }
+
+    /// B.
+    #[must_use]
+    pub fn batch(&self) -> usize {
+        self.flags.len() / self.length
+    }
+
+    /// T.
+    #[must_use]
+    pub fn length(&self) -> usize {
+        self.length
+    }
+
+    /// What step `t` carries over from step `t - 1`; the first step of a sequence carries nothing.
+    ///
+    /// # Errors
+    /// Those of candle.
+    pub fn carry(&self, t: usize, device: &Device) -> Result<Carry> {
+        let column: Vec<bool> = self.flags.iter().skip(t).step_by(self.length).copied().collect();
+        if t == 0 || column.iter().all(|first| *first) {
+            return Ok(Carry::None);
+        }
+        if column.iter().all(|first| !first) {
+            return Ok(Carry::All);
+        }
+        let column: Vec<f32> = column.into_iter().map(|first| f32::from(u8::from(first))).collect();
+        let batch = column.len();
+        Ok(Carry::Some(Tensor::from_vec(column, (batch, 1), device)?))
+    }
+}
+
+impl Carry {
+    /// `initial` where an episode begins, else `carried`; both [B, ...].
+    ///
+    /// # Errors
+    /// Those of candle.
+    pub fn select(&self, initial: &Tensor, carried: &Tensor) -> Result<Tensor> {
+        match self {
+            Self::All => Ok(carried.clone()),
+            Self::None => Ok(initial.clone()),
+            Self::Some(first) => {
+                let first =
+                    first.reshape([&first.dims()[..1], vec![1; initial.rank() - 1].as_slice()].concat())?;
+                let goes_on = first.affine(-1.0, 1.0)?;
+                initial.broadcast_mul(&first)? + carried.broadcast_mul(&goes_on)?
+            }
+        }
+    }
+
+    /// The initial state where an episode begins, else the carried one.
+    ///
+    /// # Errors
+    /// Those of candle.
+    pub fn select_state(&self, initial: &State, carried: &State) -> Result<State> {
+        let pairs = initial.branches.iter().zip(&carried.branches);
+        let branches = pairs.map(|(initial, carried)| {
+            Ok(Latent {
+                z: self.select(&initial.z, &carried.z)?,
+                h: self.select(&initial.h, &carried.h)?,
+                // The logits of the carried state are never looked at again.
+                logits: carried.logits.clone(),
+            })
+        });
+        Ok(State { branches: branches.collect::<Result<_>>()? })
+    }
+}
+
+/// Where samples get their noise from. candle's own generator cannot be seeded on the CPU.
+#[derive(Debug, Clone)]
+pub enum Sampler {
+    /// No noise: categoricals give their mode, actions their mean.
+    Mode,
+    /// The trainer's generator.
+    Seeded(Box<ChaCha8Rng>),
+}
+
+impl Sampler {
+    /// A sampler whose draws repeat with the seed.
+    #[must_use]
+    pub fn seeded(seed: u64) -> Self {
+        Self::Seeded(Box::new(ChaCha8Rng::seed_from_u64(seed)))
+    }
+
+    /// Standard Gumbel noise of this shape; none for the mode.
+    ///
+    /// # Errors
+    /// Those of candle.
+    pub fn gumbel(&mut self, shape: &[usize], device: &Device) -> Result<Option<Tensor>> {
+        let gumbel = Gumbel::new(0f32, 1f32).map_err(candle_core::Error::wrap)?;
+        self.draw(shape, device, |generator| generator.sample(gumbel))
+    }
+
+    /// Standard normal noise of this shape; none for the mean.
+    ///
+    /// # Errors
+    /// Those of candle.
+    pub fn normal(&mut self, shape: &[usize], device: &Device) -> Result<Option<Tensor>> {
+        self.draw(shape, device, |generator| generator.sample(StandardNormal))
+    }
+
+    fn draw(
+        &mut self,
+        shape: &[usize],
+        device: &Device,
+        sample: impl Fn(&mut ChaCha8Rng) -> f32,
+    ) -> Result<Option<Tensor>> {
+        match self {
+            Self::Mode => Ok(None),
+            Self::Seeded(generator) => {
+                let count = shape.iter().product();
+                let values: Vec<f32> = (0..count).map(|_| sample(generator)).collect();
+                Tensor::from_vec(values, shape, device).map(Some)
+            }
+        }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn an_episode_begins_only_where_it_is_marked_and_at_the_start_of_a_sequence() {
+        let device = Device::Cpu;
+        let first = FirstSteps::new(vec![false, false, true, true, false, false], 3);
+        let initial = Tensor::zeros((2, 2), candle_core::DType::F32, &device).unwrap();
+        let carried = Tensor::ones((2, 2), candle_core::DType::F32, &device).unwrap();
+        let at = |t: usize| {
+            first.carry(t, &device).unwrap().select(&initial, &carried).unwrap().to_vec2::<f32>().unwrap()
+        };
+        assert_eq!(at(0), [[0.0, 0.0], [0.0, 0.0]]);
+        assert_eq!(at(1), [[1.0, 1.0], [1.0, 1.0]]);
+        assert_eq!(at(2), [[0.0, 0.0], [1.0, 1.0]]);
+    }
+
+    #[test]
+    fn gumbel_noise_draws_classes_as_often_as_they_are_probable() {
+        let device = Device::Cpu;
+        let logits = Tensor::new(&[0.6f32, 0.3, 0.1], &device).unwrap().log().unwrap();
+        let logits = logits.broadcast_as((20_000, 3)).unwrap();
+        let noise = Sampler::seeded(5).gumbel(&[20_000, 3], &device).unwrap();
+        let sample = crate::ops::straight_through_sample(&logits, 0.0, noise.as_ref()).unwrap();
+        let share = sample.mean(0).unwrap().to_vec1::<f32>().unwrap();
+        for (found, expected) in share.iter().zip([0.6, 0.3, 0.1]) {
+            assert!((found - expected).abs() < 0.02, "{share:?}");
+        }
+    }
+}

@@ -1,0 +1,147 @@
+//! What every world model can do, whichever it is.
+
+use candle_core::{Result, Tensor};
+use rcwm_models::settings::{ModelKind, ModelSettings};
+
+use super::decoder::Picture;
+use super::latent::{FirstSteps, Sampler, State};
+use super::parameters::{Built, Scope};
+use super::{rcwm::Rcwm, vanilla::Vanilla};
+
+/// A filtered batch: every tensor [B, T, ...].
+#[derive(Debug, Clone)]
+pub struct Observed {
+    /// States predicted before the image was seen.
+    pub priors: State,
+    /// States after.
+    pub posteriors: State,
+    /// e_{t-1} at step t [B, T, n, m]; none for the vanilla baseline.
+    pub interaction: Option<Tensor>,
+}
+
+/// Pictures of a state.
+#[derive(Debug, Clone)]
+pub struct Decoded {
+    /// The whole picture [..., 64, 64, 3], in the range of `x/255 - 0.5` (eq. 8).
+    pub image: Tensor,
+    /// Each branch's part in it, the robot's first.
+    pub pictures: Vec<Picture>,
+}
+
+/// A world model.
+#[derive(Debug, Clone)]
+pub enum World {
+    /// The paper's.
+    Rcwm(Rcwm),
+    /// The baseline.
+    Vanilla(Vanilla),
+}
+
+impl World {
+    /// The model that the settings name.
+    ///
+    /// # Errors
+    /// Those of [`Scope::get`].
+    pub fn new(scope: &Scope<'_>, settings: &ModelSettings) -> Built<Self> {
+        Ok(match settings.kind {
+            ModelKind::Rcwm => Self::Rcwm(Rcwm::new(scope, settings)?),
+            ModelKind::Vanilla => Self::Vanilla(Vanilla::new(scope, settings)?),
+        })
+    }
+
+    /// Embeddings of u8 images [B, T, 64, 64, 3], one per branch: [B, T, E].
+    ///
+    /// # Errors
+    /// Those of candle.
+    pub fn encode(&self, images: &Tensor) -> Result<Vec<Tensor>> {
+        let (batch, length) = (images.dim(0)?, images.dim(1)?);
+        let images = images.flatten(0, 1)?; // [B*T, 64, 64, 3]
+        let embeds = match self {
+            Self::Rcwm(model) => model.encode(&images)?,
+            Self::Vanilla(model) => model.encode(&images)?,
+        };
+        embeds.iter().map(|embed| embed.reshape((batch, length, ()))).collect()
+    }
+
+    /// The learned state an episode starts from, [B, ...].
+    ///
+    /// # Errors
+    /// Those of candle.
+    pub fn initial(&self, batch: usize) -> Result<State> {
+        match self {
+            Self::Rcwm(model) => model.initial(batch),
+            Self::Vanilla(model) => model.initial(batch),
+        }
+    }
+
+    /// Filters a batch of sequences: `embeds` [B, T, E] per branch, `actions` [B, T, action], each the one that led to its image.
+    ///
+    /// # Errors
+    /// Those of candle.
+    pub fn observe(
+        &self,
+        embeds: &[Tensor],
+        actions: &Tensor,
+        first: &FirstSteps,
+        sampler: &mut Sampler,
+    ) -> Result<Observed> {
+        match self {
+            Self::Rcwm(model) => model.observe(embeds, actions, first, sampler),
+            Self::Vanilla(model) => model.observe(embeds, actions, first, sampler),
+        }
+    }
+
+    /// One imagined step: the state after `action` [B, action], drawn from the priors.
+    ///
+    /// # Errors
+    /// Those of candle.
+    pub fn imagine_step(&self, state: &State, action: &Tensor, sampler: &mut Sampler) -> Result<State> {
+        match self {
+            Self::Rcwm(model) => model.imagine_step(state, action, sampler),
+            Self::Vanilla(model) => model.imagine_step(state, action, sampler),
+        }
+    }
+
+    /// Imagines with given actions [B, L, action] from a state [B, ...]: the L states after them, [B, L, ...].
+    ///
+    /// # Errors
+    /// Those of candle.
+    pub fn imagine(&self, start: &State, actions: &Tensor, sampler: &mut Sampler) -> Result<State> {
+        let actions = sequence(actions)?; // [L, B, action]
+        let mut states: Vec<State> = Vec::with_capacity(actions.dim(0)?);
+        for t in 0..actions.dim(0)? {
+            let state = states.last().unwrap_or(start);
+            states.push(self.imagine_step(state, &at_step(&actions, t)?, sampler)?);
+        }
+        State::stack(&states, 1)
+    }
+
+    /// The pictures of a state [..., ...].
+    ///
+    /// # Errors
+    /// Those of candle.
+    pub fn decode(&self, state: &State) -> Result<Decoded> {
+        match self {
+            Self::Rcwm(model) => model.decode(state),
+            Self::Vanilla(model) => model.decode(state),
+        }
+    }
+}
+
+/// `a / max(1, |a|)`: actions beyond the limits count as the limits. The divisor gets no gradient.
+///
+/// # Errors
+/// Those of candle.
+pub fn normalised_action(action: &Tensor) -> Result<Tensor> {
+    action / action.detach().abs()?.maximum(1.0)?
+}
+
+/// [B, T, ...] as contiguous [T, B, ...], whose steps are then slices without a copy.
+pub(super) fn sequence(x: &Tensor) -> Result<Tensor> {
+    x.transpose(0, 1)?.contiguous()
+}
+
+/// Step `t` of [T, B, ...]: [B, ...].
+pub(super) fn at_step(x: &Tensor, t: usize) -> Result<Tensor> {
+    x.narrow(0, t, 1)?.squeeze(0)
+}

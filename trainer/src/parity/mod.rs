@@ -1,0 +1,61 @@
+//! Our numbers against the authors': a reference file holds weights, inputs and what their implementation made of them.
+//!
+//! A group of tensors is checked by computing it with our model on the file's weights, from the file's inputs on. What the file
+//! holds and nothing here computes is listed as not checked; it never counts as a pass.
+
+mod forward;
+mod reference;
+mod report;
+
+use std::path::Path;
+
+use candle_core::Device;
+
+pub use forward::Group;
+pub use reference::{Reference, ReferenceError};
+pub use report::{Comparison, GroupReport, Report, Unchecked};
+
+use crate::model::parameters::ParameterError;
+
+/// Forward values may differ by this much, absolute.
+pub const FORWARD_TOLERANCE: f32 = 1e-5;
+
+/// Why a file could not be compared.
+#[derive(Debug, thiserror::Error)]
+pub enum ParityError {
+    /// The file is unusable.
+    #[error(transparent)]
+    Reference(#[from] ReferenceError),
+    /// Its weights do not fit the model.
+    #[error("reference weights: {0}")]
+    Parameters(#[from] ParameterError),
+    /// A tensor operation failed.
+    #[error(transparent)]
+    Tensor(#[from] candle_core::Error),
+}
+
+/// Compares a reference file with our model.
+///
+/// # Errors
+/// See [`ParityError`]; a difference is no error but part of the report.
+pub fn check_file(path: &Path, groups: &[Group], device: &Device) -> Result<Report, ParityError> {
+    check(&Reference::read(path)?, groups, device)
+}
+
+/// Compares a reference with our model, group by group.
+///
+/// # Errors
+/// See [`ParityError`]; a difference is no error but part of the report.
+pub fn check(reference: &Reference, groups: &[Group], device: &Device) -> Result<Report, ParityError> {
+    let mut forward = forward::Forward::new(reference, device)?;
+    let mut reports = Vec::new();
+    for group in groups {
+        let comparisons = forward
+            .compute(*group)?
+            .into_iter()
+            .map(|(name, found)| Comparison::absolute(reference, &name, &found))
+            .collect::<Result<_, ParityError>>()?;
+        reports.push(GroupReport { group: *group, tolerance: FORWARD_TOLERANCE, comparisons });
+    }
+    Ok(Report::new(reference, reports))
+}

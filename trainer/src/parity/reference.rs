@@ -1,0 +1,143 @@
+use std::collections::{BTreeMap, HashMap};
+use std::path::Path;
+
+use candle_core::{Device, Tensor};
+use rcwm_models::files::{FileError, read_capped};
+use rcwm_models::settings::{ModelKind, ModelSettings, SettingsError};
+use rcwm_models::tensors::{Tensors, TensorsError, Values};
+use safetensors::SafeTensors;
+
+/// Largest reference file accepted, in bytes.
+const REFERENCE_BYTES_MAX: u64 = 4 << 30;
+
+/// Why a reference file was refused.
+#[derive(Debug, thiserror::Error)]
+pub enum ReferenceError {
+    /// The file could not be read.
+    #[error(transparent)]
+    File(#[from] FileError),
+    /// A tensor is missing or of another type, or the file is no safetensors file.
+    #[error("reference file: {0}")]
+    Tensors(#[from] TensorsError),
+    /// The sizes in its metadata are missing, no numbers, or contradict the tensors.
+    #[error("reference file: metadata {key}: found {found}, expected {expected}")]
+    Metadata {
+        /// The key.
+        key: &'static str,
+        /// What was found.
+        found: String,
+        /// What was expected.
+        expected: String,
+    },
+    /// The sizes do not fit together.
+    #[error("reference file: {0}")]
+    Settings(#[from] SettingsError),
+}
+
+/// Weights, inputs and expected values of one update, with the sizes they belong to.
+#[derive(Debug, Clone)]
+pub struct Reference {
+    /// The sizes of the model.
+    pub settings: ModelSettings,
+    /// B.
+    pub batch: usize,
+    /// T.
+    pub length: usize,
+    /// L: states of an imagination, the start included.
+    pub horizon: usize,
+    /// All tensors by name.
+    pub tensors: Tensors,
+}
+
+impl Reference {
+    /// Reads a reference file.
+    ///
+    /// # Errors
+    /// See [`ReferenceError`].
+    pub fn read(path: &Path) -> Result<Self, ReferenceError> {
+        let bytes = read_capped(path, REFERENCE_BYTES_MAX)?;
+        let (_, header) = SafeTensors::read_metadata(&bytes).map_err(TensorsError::Format)?;
+        let metadata = header.metadata().clone().unwrap_or_default();
+        Self::new(&metadata, Tensors::from_bytes(&bytes)?)
+    }
+
+    fn new(metadata: &HashMap<String, String>, tensors: Tensors) -> Result<Self, ReferenceError> {
+        let size = |key: &'static str| {
+            let text = metadata.get(key).map_or("nothing", String::as_str);
+            text.parse::<usize>().map_err(|_| ReferenceError::Metadata {
+                key,
+                found: text.to_owned(),
+                expected: "a size".into(),
+            })
+        };
+        // Widths that the metadata does not name are read off the weights.
+        let width = |name: &str, axis: usize| -> Result<usize, ReferenceError> {
+            let shape = tensors.get(name)?.shape();
+            shape.get(axis).copied().ok_or_else(|| {
+                let (found, expected) = (format!("{shape:?}"), format!("at least {} dimensions", axis + 1));
+                TensorsError::Unexpected { name: name.to_owned(), found, expected }.into()
+            })
+        };
+        let settings = ModelSettings {
+            kind: ModelKind::Rcwm,
+            cnn_depth: size("depth")?,
+            categoricals: size("stoch")?,
+            classes: size("disc")?,
+            deter: size("deter")?,
+            hidden: width("weights/robot.input.linear.weight", 0)?,
+            units: size("units")?,
+            bins: width("weights/heads.reward.out.weight", 0)?,
+            action: width("input/action", 2)?,
+            unimix: 0.01,
+        };
+        settings.validate()?;
+        let (batch, length, horizon) = (size("batch")?, size("length")?, size("horizon")?);
+        for (key, axis, size) in [("batch", 0, batch), ("length", 1, length)] {
+            let found = width("input/image", axis)?;
+            if found != size {
+                let (found, expected) = (size.to_string(), format!("{found}, the size of input/image"));
+                return Err(ReferenceError::Metadata { key, found, expected });
+            }
+        }
+        for (key, found, least) in [("length", length, 3), ("horizon", horizon, 2)] {
+            if found < least {
+                let (found, expected) = (found.to_string(), format!("at least {least}"));
+                return Err(ReferenceError::Metadata { key, found, expected });
+            }
+        }
+        Ok(Self { settings, batch, length, horizon, tensors })
+    }
+
+    /// A tensor of the file.
+    ///
+    /// # Errors
+    /// [`TensorsError::Missing`] or candle's.
+    pub fn tensor(&self, name: &str, device: &Device) -> Result<Tensor, super::ParityError> {
+        let values = self.tensors.get(name).map_err(ReferenceError::from)?;
+        Ok(to_tensor(values, device)?)
+    }
+
+    /// The weights, by the parameters' names.
+    ///
+    /// # Errors
+    /// Candle's.
+    pub fn weights(&self, device: &Device) -> Result<BTreeMap<String, Tensor>, candle_core::Error> {
+        let named = self.tensors.0.iter().filter_map(|(name, values)| {
+            name.strip_prefix("weights/").map(|name| Ok((name.to_owned(), to_tensor(values, device)?)))
+        });
+        named.collect()
+    }
+}
+
+/// A host array as a tensor on `device`.
+///
+/// # Errors
+/// Candle's.
+pub fn to_tensor(values: &Values, device: &Device) -> Result<Tensor, candle_core::Error> {
+    let shape = values.shape();
+    match values {
+        Values::F32(array) => Tensor::from_iter(array.iter().copied(), device)?.reshape(shape),
+        Values::I64(array) => Tensor::from_iter(array.iter().copied(), device)?.reshape(shape),
+        Values::U8(array) => Tensor::from_iter(array.iter().copied(), device)?.reshape(shape),
+    }
+}
