@@ -9,7 +9,8 @@ use std::process::{Child, Command, ExitStatus, Output, Stdio};
 use std::sync::atomic::{AtomicU32, Ordering};
 use std::time::{Duration, Instant};
 
-use rcwm_models::wire::{forget_prefix, list_leftovers};
+use iceoryx2::prelude::*;
+use rcwm_models::wire::{LinkSettings, Observation, ObserverLink, Wait, forget_prefix, list_leftovers};
 
 /// How long anything in a test may take before it counts as hung.
 pub const PATIENCE: Duration = Duration::from_secs(120);
@@ -17,7 +18,10 @@ pub const PATIENCE: Duration = Duration::from_secs(120);
 /// The root of the repository.
 #[must_use]
 pub fn root() -> PathBuf {
-    Path::new(env!("CARGO_MANIFEST_DIR")).parent().expect("the tests are a member of the workspace").to_path_buf()
+    Path::new(env!("CARGO_MANIFEST_DIR"))
+        .parent()
+        .expect("the tests are a member of the workspace")
+        .to_path_buf()
 }
 
 /// The bundle that is shipped for the demo.
@@ -36,7 +40,11 @@ pub fn binary(name: &str) -> PathBuf {
     // target/release/deps/test-1234 -> target/release
     let folder = own.parent().and_then(Path::parent).expect("tests lie in target/<profile>/deps");
     let path = folder.join(name);
-    assert!(path.is_file(), "{} is missing: build it first with `make test`, or cargo build --release --workspace --bins", path.display());
+    assert!(
+        path.is_file(),
+        "{} is missing: build it first with `make test`, or cargo build --release --workspace --bins",
+        path.display()
+    );
     path
 }
 
@@ -71,6 +79,12 @@ impl Domain {
     #[must_use]
     pub fn prefix(&self) -> &str {
         &self.prefix
+    }
+
+    /// Settings of a link in this domain.
+    #[must_use]
+    pub fn link(&self, instance: &str) -> LinkSettings {
+        LinkSettings { prefix: Some(self.prefix.clone()), ..LinkSettings::new(instance) }
     }
 
     /// A command for a built binary in this domain.
@@ -237,4 +251,69 @@ pub fn eventually(what: &str, mut condition: impl FnMut() -> bool) {
 pub fn read_json(path: &Path) -> serde_json::Value {
     let text = std::fs::read_to_string(path).unwrap_or_else(|error| panic!("{}: {error}", path.display()));
     serde_json::from_str(&text).unwrap_or_else(|error| panic!("{}: {error}\n{text}", path.display()))
+}
+
+/// Listens in on an instance, so that a test knows how far its simulator has come.
+pub struct Observer(ObserverLink);
+
+impl Observer {
+    /// Joins an instance.
+    ///
+    /// # Panics
+    /// When shared memory cannot be used.
+    #[must_use]
+    pub fn new(domain: &Domain, instance: &str) -> Self {
+        Self(ObserverLink::open(domain.link(instance)).expect("the instance can be joined"))
+    }
+
+    /// Waits for an observation that fits, and gives its sequence.
+    ///
+    /// # Panics
+    /// When none comes within [`PATIENCE`].
+    pub fn wait_for(&self, mut fits: impl FnMut(&Observation) -> bool) -> u64 {
+        let start = Instant::now();
+        while start.elapsed() < PATIENCE {
+            let wait = self.0.wait_observation(Duration::from_millis(100)).expect("the link works");
+            match wait {
+                Wait::Message(sample) if fits(sample.payload()) => return sample.payload().sequence,
+                _ => {}
+            }
+        }
+        panic!("no fitting observation within {PATIENCE:?}");
+    }
+}
+
+/// An observation as a version before the first would have had it.
+#[derive(Debug, Clone, Copy, ZeroCopySend)]
+#[type_name("rcwm.Observation.v0")]
+#[repr(C)]
+struct OldObservation {
+    sequence: u64,
+}
+
+/// Holds an instance's observation service with the message of another version.
+pub struct OldPeer {
+    _service:
+        iceoryx2::service::port_factory::publish_subscribe::PortFactory<ipc::Service, OldObservation, ()>,
+    _node: Node<ipc::Service>,
+}
+
+impl OldPeer {
+    /// Takes the instance.
+    ///
+    /// # Panics
+    /// When shared memory cannot be used.
+    #[must_use]
+    pub fn new(domain: &Domain, instance: &str) -> Self {
+        let mut config = Config::default();
+        config.global.prefix = FileName::new(domain.prefix().as_bytes()).expect("a plain prefix");
+        let node = NodeBuilder::new().config(&config).create::<ipc::Service>().expect("a node");
+        let name = format!("rcwm/{instance}/observation");
+        let service = node
+            .service_builder(&name.as_str().try_into().expect("a plain name"))
+            .publish_subscribe::<OldObservation>()
+            .open_or_create()
+            .expect("the instance is free");
+        Self { _service: service, _node: node }
+    }
 }

@@ -1,0 +1,74 @@
+//! What must never depend on what (ARCHITECTURE.md, invariants), asked of cargo and of the built binaries.
+
+use std::process::Command;
+
+use rcwm_tests::{binary, output, root};
+
+/// The crates behind the words of the rule.
+const CANDLE: &[&str] = &["candle-core", "candle-nn"];
+const TRACT: &[&str] = &["tract-core", "tract-onnx"];
+const PYTHON: &[&str] = &["pyo3", "pyo3-ffi"];
+
+fn normal_dependencies(package: &str) -> Vec<String> {
+    let mut command = Command::new(env!("CARGO"));
+    command.current_dir(root()).args([
+        "tree",
+        "--locked",
+        "--edges",
+        "normal,build",
+        "--prefix",
+        "none",
+        "--format",
+        "{p}",
+    ]);
+    command.args(["--package", package]);
+    let output = output(command);
+    assert!(output.status.success(), "{}", String::from_utf8_lossy(&output.stderr));
+    let text = String::from_utf8_lossy(&output.stdout).into_owned();
+    text.lines().filter_map(|line| line.split_whitespace().next()).map(str::to_owned).collect()
+}
+
+fn assert_without(package: &str, forbidden: &[&[&str]]) {
+    let dependencies = normal_dependencies(package);
+    assert!(dependencies.iter().any(|name| name == "rcwm-models"), "{package} was looked at");
+    for name in forbidden.concat() {
+        assert!(!dependencies.iter().any(|found| found == name), "{package} depends on {name}");
+    }
+}
+
+#[test]
+fn the_contract_depends_on_no_engine_and_no_python() {
+    assert_without("rcwm-models", &[CANDLE, TRACT, PYTHON]);
+}
+
+#[test]
+fn the_runtime_depends_on_neither_candle_nor_python() {
+    assert_without("rcwm-runtime", &[CANDLE, PYTHON]);
+}
+
+#[test]
+fn the_trainer_depends_on_neither_tract_nor_python() {
+    assert_without("rcwm-trainer", &[TRACT, PYTHON]);
+}
+
+#[test]
+fn the_simulator_depends_on_neither_candle_nor_tract() {
+    assert_without("rcwm-simulator", &[CANDLE, TRACT]);
+}
+
+#[test]
+fn the_runtime_binary_loads_no_python() {
+    let path = binary("rcwm-runtime");
+    let mut command = Command::new("ldd");
+    command.arg(&path);
+    let listed = output(command);
+    assert!(listed.status.success(), "ldd failed");
+    let listed = String::from_utf8_lossy(&listed.stdout).to_lowercase();
+    assert!(listed.contains("libc.so"), "ldd lists libraries:\n{listed}");
+    assert!(!listed.contains("python"), "{listed}");
+    let bytes = std::fs::read(&path).unwrap();
+    let holds = |needle: &[u8]| bytes.windows(needle.len()).any(|window| window == needle);
+    assert!(holds(b"tract"), "names of linked crates can be found in the binary");
+    assert!(!holds(b"candle-core") && !holds(b"candle_core") && !holds(b"Py_Initialize"));
+    println!("rcwm-runtime: {:.1} MB", bytes.len() as f64 / 1e6);
+}
