@@ -1,0 +1,358 @@
+//! The serving loop: publish an observation, get an action, execute it.
+//!
+//! A controller may come, go or die at any time: in lock-step the present observation is published again for the next one, in
+//! real time the last action is held until there is one.
+
+use std::path::PathBuf;
+use std::sync::atomic::{AtomicBool, Ordering};
+use std::time::{Duration, Instant};
+
+use rcwm_models::ACTION_LEN;
+use rcwm_models::wire::clock::monotonic_ns;
+use rcwm_models::wire::{Action, Events, Observation, ObservationFlags, SimulatorLink, Wait};
+
+use crate::environment::{Environment, STEPS_MAX};
+use crate::policy::{Policy, Script};
+use crate::report::Tally;
+use crate::schedule::{Schedule, sleep_until};
+use crate::{SimulatorError, snapshot};
+
+/// The longest single wait, so that a stop is noticed.
+const WAIT_SLICE: Duration = Duration::from_millis(100);
+/// After so much silence a lock-step observation is published again: its receiver may have died with it.
+const SILENCE: Duration = Duration::from_secs(1);
+/// Steps between two snapshots of the first episode.
+const SNAPSHOT_STEPS: u32 = 50;
+
+/// How time passes.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum Pace {
+    /// Each observation waits for its answer.
+    LockStep,
+    /// As lock-step with a scripted policy, but nobody is waited for.
+    Free,
+    /// A fixed clock.
+    RealTime {
+        /// Time between two observations.
+        period_ns: u64,
+    },
+}
+
+/// How to serve.
+#[derive(Debug, Clone)]
+pub struct ServeSettings {
+    /// The link's name, for messages.
+    pub instance: String,
+    /// The first episode's number.
+    pub first_episode: u64,
+    /// How many episodes; `None` until stopped.
+    pub episodes: Option<u64>,
+    /// Decisions in an episode, 1 to [`STEPS_MAX`].
+    pub steps_max: u32,
+    /// How time passes.
+    pub pace: Pace,
+    /// Who decides.
+    pub policy: Policy,
+    /// The longest silence of the controller that is borne: at any time in lock-step, before the first episode in real
+    /// time. `None` for ever.
+    pub silence_max: Option<Duration>,
+    /// Folder for pictures of the first episode.
+    pub snapshots: Option<PathBuf>,
+}
+
+/// Where the run is: everything of an observation that the environment does not know.
+#[derive(Debug, Clone, Copy, Default)]
+struct Place {
+    sequence: u64,
+    episode: u64,
+    step: u32,
+    executed: [f32; ACTION_LEN],
+    held: bool,
+    scheduled_ns: u64,
+    /// When it was published for the first time.
+    published_ns: u64,
+}
+
+/// What the loop needs to know about an observation that is on its way.
+struct Published {
+    reward: f32,
+    solved: bool,
+    published_ns: u64,
+}
+
+/// An answer to the present observation, fit to be executed; `None` when there was none.
+type Answer = Option<[f32; ACTION_LEN]>;
+
+/// Serves until the episodes are done or `stop` is set, then says goodbye to the controller.
+///
+/// `progress` is called with each new place: episode and step.
+///
+/// # Errors
+/// See [`SimulatorError`]; the controller is told that the simulator closes in this case as well.
+pub fn serve(
+    environment: &Environment,
+    link: SimulatorLink,
+    settings: &ServeSettings,
+    stop: &AtomicBool,
+    progress: impl Fn(u64, u32),
+) -> Result<Tally, SimulatorError> {
+    let mut server = Server {
+        environment,
+        link: &link,
+        settings,
+        stop,
+        tally: Tally::default(),
+        place: Place::default(),
+        met_controller: false,
+        progress: &progress,
+    };
+    let start = Instant::now();
+    let served = server.episodes();
+    let mut tally = server.tally;
+    tally.seconds = start.elapsed().as_secs_f64();
+    let closed = link.close();
+    served?;
+    closed?;
+    Ok(tally)
+}
+
+struct Server<'a> {
+    environment: &'a Environment,
+    link: &'a SimulatorLink,
+    settings: &'a ServeSettings,
+    stop: &'a AtomicBool,
+    tally: Tally,
+    place: Place,
+    /// Whether any answer has come; the fixed clock does not start before.
+    met_controller: bool,
+    progress: &'a dyn Fn(u64, u32),
+}
+
+impl Server<'_> {
+    fn episodes(&mut self) -> Result<(), SimulatorError> {
+        let first = self.settings.first_episode;
+        let end = self.settings.episodes.map(|count| first.saturating_add(count));
+        let mut episode = first;
+        while end.is_none_or(|end| episode < end) && !self.stopped() {
+            if !self.episode(episode)? {
+                break;
+            }
+            episode += 1;
+        }
+        Ok(())
+    }
+
+    fn stopped(&self) -> bool {
+        self.stop.load(Ordering::Relaxed)
+    }
+
+    /// Runs one episode; `false` when it was stopped before its end.
+    fn episode(&mut self, episode: u64) -> Result<bool, SimulatorError> {
+        self.environment.reset(episode)?;
+        let mut script = Script::new(self.settings.policy, self.environment.settings().seed, episode);
+        self.place = Place { sequence: self.place.sequence, episode, ..Place::default() };
+        let (mut sum, mut solved) = (0.0, false);
+        let mut clock = self.clock();
+        self.publish_new(monotonic_ns(), &mut sum, &mut solved)?;
+        loop {
+            let Some(answer) = self.answer(&mut clock)? else { return Ok(false) };
+            if self.place.step == self.settings.steps_max.min(STEPS_MAX) {
+                break;
+            }
+            let due_ns = clock.as_ref().map_or_else(monotonic_ns, Schedule::next_ns);
+            let action =
+                if self.settings.policy.is_scripted() { script.decide(self.environment)? } else { answer };
+            self.execute(action)?;
+            self.publish_new(due_ns, &mut sum, &mut solved)?;
+            if let Some(clock) = &mut clock {
+                self.tally.missed += clock.advance(monotonic_ns());
+            }
+        }
+        self.tally.episodes.push((sum, solved));
+        Ok(true)
+    }
+
+    fn clock(&self) -> Option<Schedule> {
+        match self.settings.pace {
+            Pace::RealTime { period_ns } => Some(Schedule::starting_at(monotonic_ns(), period_ns)),
+            Pace::LockStep | Pace::Free => None,
+        }
+    }
+
+    /// Executes an answer, or holds the last action where there is none: zeros at the first step of an episode.
+    fn execute(&mut self, action: Answer) -> Result<(), SimulatorError> {
+        self.place.held = action.is_none();
+        let action = action.map_or(self.place.executed, |action| action.map(|x| x.clamp(-1.0, 1.0)));
+        let start_ns = monotonic_ns();
+        self.environment.step(action)?;
+        self.tally.work.add_ns(monotonic_ns() - start_ns);
+        self.tally.steps += 1;
+        self.tally.held += u64::from(self.place.held);
+        self.place.step += 1;
+        self.place.executed = action;
+        Ok(())
+    }
+
+    fn publish_new(&mut self, due_ns: u64, sum: &mut f64, solved: &mut bool) -> Result<(), SimulatorError> {
+        self.place.sequence = self.tally.observations;
+        self.place.scheduled_ns = due_ns;
+        let observation = self.publish(false)?;
+        self.place.published_ns = observation.published_ns;
+        self.tally.observations += 1;
+        *sum += f64::from(observation.reward);
+        *solved |= observation.solved;
+        (self.progress)(self.place.episode, self.place.step);
+        Ok(())
+    }
+
+    /// Publishes the present observation.
+    fn publish(&self, repeated: bool) -> Result<Published, SimulatorError> {
+        let mut slot = self.link.slot()?;
+        let solved = self.environment.write_to(&mut slot)?;
+        self.fill(&mut slot, solved, repeated);
+        if !slot.is_finite() {
+            return Err(SimulatorError::Diverged {
+                task: self.environment.settings().task.clone(),
+                episode: self.place.episode,
+                step: self.place.step,
+            });
+        }
+        self.snapshot(&slot)?;
+        let published = Published { reward: slot.reward, solved, published_ns: monotonic_ns() };
+        self.link.send(slot)?;
+        Ok(published)
+    }
+
+    fn fill(&self, observation: &mut Observation, solved: bool, repeated: bool) {
+        let Place { sequence, episode, step, executed, held, scheduled_ns, .. } = self.place;
+        observation.sequence = sequence;
+        observation.episode = episode;
+        observation.step = step;
+        observation.executed_action = executed;
+        observation.scheduled_ns = match self.settings.pace {
+            Pace::RealTime { .. } => scheduled_ns,
+            Pace::LockStep | Pace::Free => monotonic_ns(),
+        };
+        observation.period_ns = match self.settings.pace {
+            Pace::RealTime { period_ns } => period_ns,
+            Pace::LockStep | Pace::Free => 0,
+        };
+        observation.flags = ObservationFlags::default()
+            .with(ObservationFlags::FIRST, step == 0)
+            .with(ObservationFlags::LAST, step == self.settings.steps_max.min(STEPS_MAX))
+            .with(ObservationFlags::SUCCESS, solved)
+            .with(ObservationFlags::MASK_VALID, self.environment.settings().masks)
+            .with(ObservationFlags::ACTION_HELD, held)
+            .with(ObservationFlags::REPEATED, repeated)
+            .0;
+    }
+
+    fn snapshot(&self, observation: &Observation) -> Result<(), SimulatorError> {
+        let Some(folder) = &self.settings.snapshots else { return Ok(()) };
+        let first = observation.episode == self.settings.first_episode;
+        if first && observation.step.is_multiple_of(SNAPSHOT_STEPS) {
+            snapshot::write(folder, &self.environment.settings().task, observation)?;
+        }
+        Ok(())
+    }
+
+    /// The answer to the present observation, as the pace has it; `None` when stopped.
+    fn answer(&mut self, clock: &mut Option<Schedule>) -> Result<Option<Answer>, SimulatorError> {
+        match (self.settings.pace, clock) {
+            (Pace::Free, _) => {
+                let events = self.link.poll_events()?;
+                self.note(events);
+                Ok((!self.stopped()).then(|| None))
+            }
+            (Pace::RealTime { .. }, Some(clock))
+                if self.met_controller || self.settings.policy.is_scripted() =>
+            {
+                self.tick(clock)
+            }
+            (_, clock) => {
+                let answer = self.wait_for_answer()?;
+                // Waiting for the first controller is no lateness.
+                *clock = self.clock();
+                Ok(answer)
+            }
+        }
+    }
+
+    /// Real time: sleeps to the tick, then takes what has come.
+    fn tick(&mut self, clock: &Schedule) -> Result<Option<Answer>, SimulatorError> {
+        let slice_ns = WAIT_SLICE.as_nanos() as u64;
+        while monotonic_ns() < clock.next_ns() {
+            if self.stopped() {
+                return Ok(None);
+            }
+            sleep_until(clock.next_ns().min(monotonic_ns() + slice_ns));
+        }
+        let events = self.link.poll_events()?;
+        self.note(events);
+        let answer = match self.link.poll_action()? {
+            Some(action) if self.is_answer(&action) => {
+                self.tally.answer.add_ns(action.published_ns.saturating_sub(self.place.published_ns));
+                self.checked(&action)
+            }
+            _ => None,
+        };
+        Ok((!self.stopped()).then_some(answer))
+    }
+
+    /// Lock-step: waits for the answer, and publishes the observation again for a controller that is new or silent.
+    fn wait_for_answer(&mut self) -> Result<Option<Answer>, SimulatorError> {
+        let start = Instant::now();
+        let mut published = start;
+        while !self.stopped() {
+            let (wait, events) = self.link.wait_action(WAIT_SLICE)?;
+            self.note(events);
+            if let Wait::Message(action) = wait {
+                if self.is_answer(&action) {
+                    self.met_controller = true;
+                    self.tally.answer.add_ns(monotonic_ns().saturating_sub(self.place.published_ns));
+                    return Ok(Some(self.checked(&action)));
+                }
+            }
+            let silent = published.elapsed() >= SILENCE;
+            if silent {
+                self.link.clean_up_dead_peers();
+                self.check_silence(start)?;
+            }
+            if silent || events.hello {
+                self.publish(true)?;
+                self.tally.repeated += 1;
+                published = Instant::now();
+            }
+        }
+        Ok(None)
+    }
+
+    fn check_silence(&self, start: Instant) -> Result<(), SimulatorError> {
+        match self.settings.silence_max {
+            Some(max) if start.elapsed() >= max => Err(SimulatorError::NoController {
+                instance: self.settings.instance.clone(),
+                seconds: max.as_secs(),
+            }),
+            _ => Ok(()),
+        }
+    }
+
+    fn note(&mut self, events: Events) {
+        self.tally.controllers_came += u64::from(events.hello);
+        self.tally.controllers_left += u64::from(events.closed);
+    }
+
+    /// Whether an action answers the present observation; others are counted.
+    fn is_answer(&mut self, action: &Action) -> bool {
+        let answers = action.answers == self.place.sequence;
+        self.tally.dropped += u64::from(!answers);
+        answers
+    }
+
+    /// An action with a value that is not finite is no answer.
+    fn checked(&mut self, action: &Action) -> Answer {
+        let finite = action.action.iter().all(|x| x.is_finite());
+        self.tally.refused += u64::from(!finite);
+        finite.then_some(action.action)
+    }
+}
