@@ -1,4 +1,5 @@
 //! Bundles that are damaged, incomplete or hostile are refused with one clear line and a non-zero exit code.
+#![allow(clippy::unwrap_used, reason = "a test may panic")]
 
 use std::fs;
 use std::path::Path;

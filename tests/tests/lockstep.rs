@@ -1,4 +1,5 @@
 //! The loop between the real simulator and the real runtime: nothing is lost, nothing is answered twice.
+#![allow(clippy::unwrap_used, reason = "a test may panic")]
 
 use std::path::Path;
 use std::process::Command;
