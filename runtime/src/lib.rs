@@ -1,1 +1,42 @@
-//! Placeholder.
+//! Deploys an exported RCWM bundle as a controller.
+//!
+//! | module | holds |
+//! | --- | --- |
+//! | [`engine`] | what runs an ONNX part: tract, or ONNX Runtime (feature `ort`) |
+//! | [`policy`] | one tick: image and executed action in, action distribution out; carries z and h of both branches |
+//! | [`controller`] | the loop over shared memory: order of observations, fallback, action limits, counters |
+//! | [`telemetry`] | latency histograms, one per stage |
+//! | [`record`] | films, strips and episodes of what the policy saw, written beside the loop |
+//! | [`verify`] | a bundle against its golden values |
+//! | [`inspect`] | what a bundle holds and what a tick costs |
+//! | [`bench`] | the tick's latency on this machine, engines interleaved |
+//!
+//! A policy without shared memory:
+//!
+//! ```no_run
+//! use rcwm_runtime::{EngineSettings, Policy};
+//!
+//! let mut policy = Policy::load("models/bundles/debug".as_ref(), EngineSettings::tract())?;
+//! let image = vec![0_u8; rcwm_models::IMAGE_BYTES]; // 64 x 64 x 3, upright, RGB
+//! let mut executed = [0.0; rcwm_models::ACTION_LEN];
+//! for step in 0..250 {
+//!     let decision = policy.observe(&image, &executed, step == 0)?;
+//!     executed = decision.action; // send it to the robot; report what was really executed
+//! }
+//! # Ok::<(), rcwm_runtime::PolicyError>(())
+//! ```
+//!
+//! This crate never links candle or Python.
+
+pub mod bench;
+pub mod cli;
+pub mod controller;
+pub mod engine;
+pub mod inspect;
+pub mod policy;
+pub mod record;
+pub mod telemetry;
+pub mod verify;
+
+pub use engine::{EngineError, EngineKind, EngineSettings};
+pub use policy::{Decision, Policy, PolicyError};

@@ -1,0 +1,24 @@
+//! `rcwm-runtime inspect`.
+
+use std::path::PathBuf;
+
+use clap::Args;
+
+/// Arguments of `inspect`.
+#[derive(Debug, Args)]
+#[command(after_help = "Example:\n  rcwm-runtime inspect --bundle models/bundles/debug --json inspect.json")]
+pub(super) struct InspectArguments {
+    /// The bundle's folder
+    #[arg(long, value_name = "DIR")]
+    bundle: PathBuf,
+    /// Writes everything to this file as JSON
+    #[arg(long, value_name = "FILE")]
+    json: Option<PathBuf>,
+}
+
+pub(super) fn run(arguments: &InspectArguments) -> anyhow::Result<()> {
+    let bundle = super::open_bundle(&arguments.bundle)?;
+    let info = crate::inspect::inspect(&bundle)?;
+    print!("{}", info.text());
+    super::write_json(arguments.json.as_ref(), &info)
+}

@@ -1,0 +1,155 @@
+//! The command line.
+//!
+//! | exit code | meaning |
+//! | --- | --- |
+//! | 0 | done; also when ended by Ctrl-C or SIGTERM, after the summary |
+//! | 1 | an error: one line on stderr says which, and what to do; or a bundle that does not verify |
+//! | 2 | the command line was not understood |
+//! | 3 | no observation came within --timeout |
+//! | 130 | ended at once by a second Ctrl-C |
+
+mod bench;
+mod inspect;
+mod run;
+mod status;
+mod verify;
+
+use std::path::{Path, PathBuf};
+use std::process::ExitCode;
+use std::sync::Arc;
+use std::sync::atomic::{AtomicBool, Ordering};
+
+use anyhow::Context;
+use clap::{Parser, Subcommand, ValueEnum};
+use rcwm_models::bundle::Bundle;
+use serde::Serialize;
+
+use crate::controller::ControllerError;
+use crate::engine::EngineKind;
+
+const EXIT_NO_OBSERVATION: u8 = 3;
+const EXIT_AT_ONCE: i32 = 130;
+
+/// Deploys an exported RCWM bundle as a controller.
+#[derive(Debug, Parser)]
+#[command(name = "rcwm-runtime", version, about, after_help = EXAMPLES)]
+struct Arguments {
+    #[command(subcommand)]
+    verb: Verb,
+}
+
+const EXAMPLES: &str = "\
+Examples:
+  rcwm-runtime inspect --bundle models/bundles/debug
+  rcwm-runtime verify --bundle models/bundles/debug
+  rcwm-runtime run --bundle models/bundles/debug --instance demo --record runs/demo --json runs/demo.json
+  rcwm-runtime bench --bundle models/bundles/debug --engine all --ticks 2000
+
+Exit codes:
+  0 done (also after Ctrl-C), 1 error or not verified, 2 usage, 3 no observation within --timeout, 130 second Ctrl-C
+
+Environment:
+  ORT_DYLIB_PATH  ONNX Runtime's library, for --engine ort (PyPI onnxruntime: capi/libonnxruntime.so.1.31.1)
+  RCWM_PREFIX     prefix in shared memory; peers meet only under the same one";
+
+#[derive(Debug, Subcommand)]
+enum Verb {
+    /// Answers a simulator's (or a robot's) observations over shared memory
+    Run(run::RunArguments),
+    /// Checks a bundle against its golden values: every part and the whole tick
+    Verify(verify::VerifyArguments),
+    /// Shows parts, shapes, sizes, operators, and what a tick costs
+    Inspect(inspect::InspectArguments),
+    /// Measures the tick's latency on this machine
+    Bench(bench::BenchArguments),
+}
+
+/// One engine or all that are there.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, ValueEnum)]
+enum EngineChoice {
+    /// tract, compiled in.
+    Tract,
+    /// ONNX Runtime.
+    Ort,
+    /// Both, where ONNX Runtime is present.
+    All,
+}
+
+impl EngineChoice {
+    /// The engines to use, and why one of them is left out. An engine that was asked for by name must be there.
+    fn engines(self) -> anyhow::Result<(Vec<EngineKind>, Option<String>)> {
+        match self {
+            Self::Tract => Ok((vec![EngineKind::Tract], None)),
+            Self::Ort => {
+                crate::engine::available(EngineKind::Ort)?;
+                Ok((vec![EngineKind::Ort], None))
+            }
+            Self::All => match crate::engine::available(EngineKind::Ort) {
+                Ok(()) => Ok((vec![EngineKind::Tract, EngineKind::Ort], None)),
+                Err(error) => Ok((vec![EngineKind::Tract], Some(error.to_string()))),
+            },
+        }
+    }
+}
+
+/// Runs the program on the process's arguments.
+#[must_use]
+pub fn main() -> ExitCode {
+    let result = match Arguments::parse().verb {
+        Verb::Run(arguments) => run::run(&arguments),
+        Verb::Verify(arguments) => verify::run(&arguments),
+        Verb::Inspect(arguments) => inspect::run(&arguments),
+        Verb::Bench(arguments) => bench::run(&arguments),
+    };
+    match result {
+        Ok(()) => ExitCode::SUCCESS,
+        Err(error) => {
+            eprintln!("error: {}", format!("{error:#}").replace('\n', " "));
+            match error.downcast_ref::<ControllerError>() {
+                Some(ControllerError::NoObservation { .. }) => ExitCode::from(EXIT_NO_OBSERVATION),
+                _ => ExitCode::FAILURE,
+            }
+        }
+    }
+}
+
+fn open_bundle(folder: &Path) -> anyhow::Result<Bundle> {
+    if !folder.is_dir() {
+        anyhow::bail!(
+            "no bundle at {}: no such folder; `rcwm-trainer export --checkpoint DIR --out {}` makes one",
+            folder.display(),
+            folder.display()
+        );
+    }
+    Bundle::open(folder).with_context(|| format!("{}", folder.display()))
+}
+
+fn write_json(path: Option<&PathBuf>, report: &impl Serialize) -> anyhow::Result<()> {
+    let Some(path) = path else { return Ok(()) };
+    let mut json = serde_json::to_vec_pretty(report).context("writing JSON")?;
+    json.push(b'\n');
+    if let Some(folder) = path.parent().filter(|folder| !folder.as_os_str().is_empty()) {
+        std::fs::create_dir_all(folder).with_context(|| format!("{}", folder.display()))?;
+    }
+    rcwm_models::files::write_atomic(path, &json)?;
+    Ok(())
+}
+
+/// A flag that Ctrl-C or SIGTERM sets; a second one ends the process at once.
+fn stop_flag() -> anyhow::Result<Arc<AtomicBool>> {
+    let stop = Arc::new(AtomicBool::new(false));
+    let flag = Arc::clone(&stop);
+    ctrlc::set_handler(move || {
+        if flag.swap(true, Ordering::Relaxed) {
+            std::process::exit(EXIT_AT_ONCE);
+        }
+    })
+    .context("listening for Ctrl-C")?;
+    Ok(stop)
+}
+
+fn progress_bar(len: usize, what: &'static str) -> indicatif::ProgressBar {
+    let style = indicatif::ProgressStyle::with_template("{msg} {wide_bar} {pos}/{len} {elapsed}")
+        .unwrap_or_else(|_| indicatif::ProgressStyle::default_bar());
+    indicatif::ProgressBar::new(len as u64).with_style(style).with_message(what)
+}

@@ -1,0 +1,104 @@
+//! The live line of `run`: drawn by its own thread, so that a slow terminal never holds up a tick.
+
+use std::sync::mpsc::{Receiver, Sender, channel};
+use std::thread::JoinHandle;
+use std::time::{Duration, Instant};
+
+use crate::controller::{Tick, TickObserver};
+use crate::telemetry::Stage;
+
+/// Time between two updates of the line.
+const UPDATE: Duration = Duration::from_millis(200);
+
+enum Message {
+    Status(String),
+    Line(String),
+}
+
+/// The loop's end of the live line.
+pub(super) struct StatusLine {
+    messages: Option<Sender<Message>>,
+    thread: Option<JoinHandle<()>>,
+    last: Instant,
+    last_observations: u64,
+    reported: usize,
+}
+
+impl StatusLine {
+    pub(super) fn start(waiting_for: &str) -> std::io::Result<Self> {
+        let (messages, received) = channel();
+        let waiting = format!("waiting for an observation on instance {waiting_for:?}");
+        let thread =
+            std::thread::Builder::new().name("status".into()).spawn(move || draw(&received, waiting))?;
+        Ok(Self {
+            messages: Some(messages),
+            thread: Some(thread),
+            last: Instant::now(),
+            last_observations: 0,
+            reported: 0,
+        })
+    }
+
+    fn send(&self, message: Message) {
+        if let Some(messages) = &self.messages {
+            // If the drawing thread is gone there is nothing left to draw on.
+            let _ = messages.send(message);
+        }
+    }
+
+    fn status(&mut self, tick: &Tick<'_>) -> String {
+        let elapsed_s = self.last.elapsed().as_secs_f64();
+        let rate_hz = (tick.counters.observations - self.last_observations) as f64 / elapsed_s;
+        let latency = tick.telemetry.latency(Stage::EndToEnd);
+        let running = tick.running;
+        format!(
+            "episode {} step {} return {:.1}{} | {} done, {} solved | p50 {:.0} us p99 {:.0} us | {rate_hz:.1} Hz",
+            running.episode,
+            running.steps,
+            running.return_sum,
+            if running.success { " success" } else { "" },
+            tick.episodes.iter().filter(|episode| episode.whole).count(),
+            tick.episodes.iter().filter(|episode| episode.whole && episode.success).count(),
+            latency.p50_us,
+            latency.p99_us,
+        )
+    }
+}
+
+impl TickObserver for StatusLine {
+    fn ticked(&mut self, tick: &Tick<'_>) {
+        for episode in &tick.episodes[self.reported..] {
+            self.send(Message::Line(episode.line()));
+        }
+        self.reported = tick.episodes.len();
+        if self.last.elapsed() >= UPDATE {
+            let status = self.status(tick);
+            self.send(Message::Status(status));
+            (self.last, self.last_observations) = (Instant::now(), tick.counters.observations);
+        }
+    }
+}
+
+impl Drop for StatusLine {
+    fn drop(&mut self) {
+        self.messages = None;
+        if let Some(thread) = self.thread.take() {
+            // A thread that panicked while drawing has nothing left to clear.
+            let _ = thread.join();
+        }
+    }
+}
+
+/// Draws until the sender is gone. Without a terminal only whole lines are printed.
+fn draw(messages: &Receiver<Message>, waiting: String) {
+    let bar = indicatif::ProgressBar::new_spinner().with_message(waiting);
+    bar.enable_steady_tick(UPDATE);
+    while let Ok(message) = messages.recv() {
+        match message {
+            Message::Status(text) => bar.set_message(text),
+            Message::Line(text) if bar.is_hidden() => eprintln!("{text}"),
+            Message::Line(text) => bar.println(text),
+        }
+    }
+    bar.finish_and_clear();
+}

@@ -1,0 +1,73 @@
+//! `rcwm-runtime verify`.
+
+use std::path::PathBuf;
+
+use clap::Args;
+use serde::Serialize;
+
+use super::EngineChoice;
+use crate::verify::{EngineReport, verify, work_units};
+
+/// Arguments of `verify`.
+#[derive(Debug, Args)]
+#[command(after_help = "Example:\n  rcwm-runtime verify --bundle models/bundles/debug --engine all\n\n\
+    Exits 0 if every part and the whole tick agree with the trainer, else 1.")]
+pub(super) struct VerifyArguments {
+    /// The bundle's folder
+    #[arg(long, value_name = "DIR")]
+    bundle: PathBuf,
+    /// Engine; `all` leaves out ONNX Runtime where it is not installed, and says so
+    #[arg(long, value_enum, default_value = "all")]
+    engine: EngineChoice,
+    /// Largest absolute error of a part's output
+    #[arg(long, value_name = "ERROR", default_value = "1e-5")]
+    tolerance: f32,
+    /// Writes everything to this file as JSON
+    #[arg(long, value_name = "FILE")]
+    json: Option<PathBuf>,
+}
+
+#[derive(Serialize)]
+struct Report<'a> {
+    bundle: &'a PathBuf,
+    tolerance: f32,
+    verified: bool,
+    left_out: &'a Option<String>,
+    engines: &'a [EngineReport],
+}
+
+pub(super) fn run(arguments: &VerifyArguments) -> anyhow::Result<()> {
+    let bundle = super::open_bundle(&arguments.bundle)?;
+    let (kinds, left_out) = arguments.engine.engines()?;
+    let bar = super::progress_bar(work_units(&bundle)? * kinds.len(), "verifying");
+    let mut engines = Vec::new();
+    for kind in kinds {
+        engines.push(verify(&bundle, kind, arguments.tolerance, &mut || bar.inc(1))?);
+    }
+    bar.finish_and_clear();
+    for engine in &engines {
+        print!("{}", engine.text());
+    }
+    if let Some(reason) = &left_out {
+        println!("engine ort not checked: {reason}");
+    }
+    let failures: Vec<String> = engines
+        .iter()
+        .flat_map(|engine| engine.failures.iter().map(move |failure| format!("{}: {failure}", engine.engine)))
+        .collect();
+    let report = Report {
+        bundle: &arguments.bundle,
+        tolerance: arguments.tolerance,
+        verified: failures.is_empty(),
+        left_out: &left_out,
+        engines: &engines,
+    };
+    super::write_json(arguments.json.as_ref(), &report)?;
+    if let Some(first) = failures.first() {
+        let more = failures.len() - 1;
+        let more = if more > 0 { format!(" (and {more} more)") } else { String::new() };
+        anyhow::bail!("{} is NOT verified: {first}{more}", arguments.bundle.display());
+    }
+    println!("verified   {}", arguments.bundle.display());
+    Ok(())
+}

@@ -1,0 +1,277 @@
+//! What runs an ONNX part. One trait, two engines.
+//!
+//! A part takes and gives its tensors in the order of its signature, as flat slices in row-major order; the caller owns every
+//! buffer, so that a tick allocates nothing on our side.
+
+#[cfg(feature = "ort")]
+mod onnxruntime;
+mod tract;
+
+use rcwm_models::bundle::{Bundle, DType, PartName, TensorSpec};
+use serde::Serialize;
+
+/// Which engine.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Hash, Serialize, clap::ValueEnum)]
+#[serde(rename_all = "lowercase")]
+pub enum EngineKind {
+    /// tract, compiled in.
+    Tract,
+    /// ONNX Runtime, loaded from the library that ORT_DYLIB_PATH names.
+    Ort,
+}
+
+impl EngineKind {
+    /// The name on the command line.
+    #[must_use]
+    pub const fn as_str(self) -> &'static str {
+        match self {
+            Self::Tract => "tract",
+            Self::Ort => "ort",
+        }
+    }
+}
+
+impl std::fmt::Display for EngineKind {
+    fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
+        f.write_str(self.as_str())
+    }
+}
+
+/// Which engine, and how much of the machine it may use.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub struct EngineSettings {
+    /// Which engine.
+    pub kind: EngineKind,
+    /// Threads inside an operator; tract always uses one.
+    pub threads: usize,
+}
+
+impl EngineSettings {
+    /// tract.
+    #[must_use]
+    pub const fn tract() -> Self {
+        Self { kind: EngineKind::Tract, threads: 1 }
+    }
+
+    /// ONNX Runtime with this many threads inside an operator.
+    #[must_use]
+    pub const fn ort(threads: usize) -> Self {
+        Self { kind: EngineKind::Ort, threads }
+    }
+
+    /// An engine with one thread.
+    #[must_use]
+    pub const fn single_threaded(kind: EngineKind) -> Self {
+        Self { kind, threads: 1 }
+    }
+}
+
+/// Why an engine could not load or run a part.
+#[derive(Debug, thiserror::Error)]
+pub enum EngineError {
+    /// Nobody said where ONNX Runtime is.
+    #[error(
+        "engine ort: ORT_DYLIB_PATH is not set; `pip install onnxruntime==1.31.1` and set it to the file \
+         site-packages/onnxruntime/capi/libonnxruntime.so.1.31.1, or use --engine tract"
+    )]
+    OrtNotNamed,
+    /// The library that was named cannot be used.
+    #[error(
+        "engine ort: ORT_DYLIB_PATH={path}: {reason}; name a libonnxruntime.so of version 1.{} or later, or use \
+         --engine tract",
+        ORT_MINOR_MIN
+    )]
+    OrtLibrary {
+        /// What ORT_DYLIB_PATH says.
+        path: String,
+        /// What is wrong with it.
+        reason: String,
+    },
+    /// The program was built without it.
+    #[error("engine ort: this program was built without the feature `ort`; use --engine tract")]
+    OrtNotBuilt,
+    /// The bundle does not have the part.
+    #[error("the bundle has no {part}")]
+    NoPart {
+        /// The part.
+        part: PartName,
+    },
+    /// A part could not be made ready.
+    #[error("engine {engine}: loading {part}: {reason}")]
+    Load {
+        /// The engine.
+        engine: EngineKind,
+        /// The part.
+        part: PartName,
+        /// What it said.
+        reason: String,
+    },
+    /// A part failed while running.
+    #[error("engine {engine}: running {part}: {reason}")]
+    Run {
+        /// The engine.
+        engine: EngineKind,
+        /// The part.
+        part: PartName,
+        /// What it said.
+        reason: String,
+    },
+    /// A tensor that was handed over is not the one the part takes or gives.
+    #[error("engine {engine}: {part}: {found}, expected {expected}")]
+    Tensor {
+        /// The engine.
+        engine: EngineKind,
+        /// The part.
+        part: PartName,
+        /// What was handed over.
+        found: String,
+        /// What the signature says.
+        expected: String,
+    },
+}
+
+/// Minor version of the oldest ONNX Runtime whose interface we use.
+pub const ORT_MINOR_MIN: u32 = 31;
+
+/// A tensor that enters a part, row-major.
+#[derive(Debug, Clone, Copy)]
+pub enum Input<'a> {
+    /// Bytes.
+    U8(&'a [u8]),
+    /// Class indices.
+    I64(&'a [i64]),
+    /// Floats.
+    F32(&'a [f32]),
+}
+
+impl Input<'_> {
+    fn describe(&self) -> (DType, usize) {
+        match self {
+            Self::U8(x) => (DType::U8, x.len()),
+            Self::I64(x) => (DType::I64, x.len()),
+            Self::F32(x) => (DType::F32, x.len()),
+        }
+    }
+}
+
+/// A place for a tensor that leaves a part, row-major.
+#[derive(Debug)]
+pub enum Output<'a> {
+    /// Class indices.
+    I64(&'a mut [i64]),
+    /// Floats.
+    F32(&'a mut [f32]),
+}
+
+impl Output<'_> {
+    fn describe(&self) -> (DType, usize) {
+        match self {
+            Self::I64(x) => (DType::I64, x.len()),
+            Self::F32(x) => (DType::F32, x.len()),
+        }
+    }
+}
+
+/// A loaded part.
+pub trait Part: Send {
+    /// Runs the part once. Inputs and outputs are in the order of the signature.
+    ///
+    /// # Errors
+    /// [`EngineError::Tensor`] before anything runs, or [`EngineError::Run`].
+    fn run(&mut self, inputs: &[Input<'_>], outputs: &mut [Output<'_>]) -> Result<(), EngineError>;
+}
+
+/// Everything an engine needs to load a part.
+struct Source<'a> {
+    part: PartName,
+    bytes: &'a [u8],
+    inputs: Vec<TensorSpec>,
+    outputs: Vec<TensorSpec>,
+}
+
+/// Loads a part of a bundle.
+///
+/// # Errors
+/// [`EngineError::NoPart`], [`EngineError::Load`], or what is wrong with ONNX Runtime's library.
+pub fn load(bundle: &Bundle, part: PartName, settings: EngineSettings) -> Result<Box<dyn Part>, EngineError> {
+    let bytes = bundle.part(part).ok_or(EngineError::NoPart { part })?;
+    let (inputs, outputs) = part.signature(&bundle.manifest.model);
+    let source = Source { part, bytes, inputs, outputs };
+    match settings.kind {
+        EngineKind::Tract => Ok(Box::new(tract::TractPart::load(source)?)),
+        EngineKind::Ort => load_ort(source, settings.threads),
+    }
+}
+
+#[cfg(feature = "ort")]
+fn load_ort(source: Source<'_>, threads: usize) -> Result<Box<dyn Part>, EngineError> {
+    Ok(Box::new(onnxruntime::OrtPart::load(source, threads)?))
+}
+
+#[cfg(not(feature = "ort"))]
+fn load_ort(_: Source<'_>, _: usize) -> Result<Box<dyn Part>, EngineError> {
+    Err(EngineError::OrtNotBuilt)
+}
+
+/// Whether the engine can be used on this machine, and if not, why.
+///
+/// # Errors
+/// What is wrong with ONNX Runtime's library; tract is always there.
+pub fn available(kind: EngineKind) -> Result<(), EngineError> {
+    match kind {
+        EngineKind::Tract => Ok(()),
+        #[cfg(feature = "ort")]
+        EngineKind::Ort => onnxruntime::environment().map(drop),
+        #[cfg(not(feature = "ort"))]
+        EngineKind::Ort => Err(EngineError::OrtNotBuilt),
+    }
+}
+
+/// Names of a part's tensors and how to say that something does not fit.
+struct Border {
+    engine: EngineKind,
+    part: PartName,
+    inputs: Vec<TensorSpec>,
+    outputs: Vec<TensorSpec>,
+}
+
+impl Border {
+    fn check(&self, inputs: &[Input<'_>], outputs: &[Output<'_>]) -> Result<(), EngineError> {
+        self.compare("inputs", inputs.iter().map(Input::describe), &self.inputs)?;
+        self.compare("outputs", outputs.iter().map(Output::describe), &self.outputs)
+    }
+
+    fn compare(
+        &self,
+        role: &str,
+        found: impl ExactSizeIterator<Item = (DType, usize)> + Clone,
+        specs: &[TensorSpec],
+    ) -> Result<(), EngineError> {
+        let expected = specs.iter().map(|spec| (spec.dtype, spec.shape.iter().product::<usize>()));
+        if found.clone().eq(expected.clone()) {
+            return Ok(());
+        }
+        let list = |tensors: Vec<(DType, usize)>| format!("{role} of type and length {tensors:?}");
+        Err(EngineError::Tensor {
+            engine: self.engine,
+            part: self.part,
+            found: list(found.collect()),
+            expected: list(expected.collect()),
+        })
+    }
+
+    fn load_error(&self, reason: impl std::fmt::Display) -> EngineError {
+        EngineError::Load { engine: self.engine, part: self.part, reason: one_line(&reason.to_string()) }
+    }
+
+    fn run_error(&self, reason: impl std::fmt::Display) -> EngineError {
+        EngineError::Run { engine: self.engine, part: self.part, reason: one_line(&reason.to_string()) }
+    }
+}
+
+fn one_line(text: &str) -> String {
+    text.split_whitespace().collect::<Vec<_>>().join(" ")
+}
+
+#[cfg(test)]
+mod tests;

@@ -1,0 +1,127 @@
+//! What decides between the mode and a sample: Gumbel noise on the latents' log-probabilities and Gaussian noise on the action.
+
+use rand::{Rng, SeedableRng};
+use rand_chacha::ChaCha8Rng;
+use rcwm_models::ACTION_LEN;
+use rcwm_models::settings::ModelSettings;
+
+use super::PolicyError;
+
+/// How latents and actions are chosen.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum Sampling {
+    /// The most probable classes and the mean action.
+    Mode,
+    /// Samples, repeatable by their seed.
+    Sample {
+        /// Seed of the generator.
+        seed: u64,
+    },
+}
+
+/// The noise of the current tick and where the next comes from.
+pub(super) struct NoiseSource {
+    rng: Option<ChaCha8Rng>,
+    /// Robot's, then the environment's: each prior's, then posterior's, `[2, n, m]`.
+    robot: Vec<f32>,
+    environment: Vec<f32>,
+}
+
+impl NoiseSource {
+    pub(super) fn new(sampling: Sampling, model: &ModelSettings) -> Self {
+        let rng = match sampling {
+            Sampling::Mode => None,
+            Sampling::Sample { seed } => Some(ChaCha8Rng::seed_from_u64(seed)),
+        };
+        let zeros = vec![0.0; 2 * model.stoch_width()];
+        Self { rng, robot: zeros.clone(), environment: zeros }
+    }
+
+    /// Fresh Gumbel noise for a tick; nothing when the mode is wanted.
+    pub(super) fn draw(&mut self) {
+        if let Some(rng) = &mut self.rng {
+            for value in self.robot.iter_mut().chain(&mut self.environment) {
+                *value = gumbel(rng);
+            }
+        }
+    }
+
+    pub(super) fn set(&mut self, robot: &[f32], environment: &[f32]) -> Result<(), PolicyError> {
+        let len = self.robot.len();
+        if robot.len() != len || environment.len() != len {
+            let found = (robot.len(), environment.len());
+            return Err(PolicyError::Observation(format!("noise of lengths {found:?}, expected {len} each")));
+        }
+        self.rng = None;
+        self.robot.copy_from_slice(robot);
+        self.environment.copy_from_slice(environment);
+        Ok(())
+    }
+
+    pub(super) fn robot(&self) -> &[f32] {
+        &self.robot
+    }
+
+    pub(super) fn environment(&self) -> &[f32] {
+        &self.environment
+    }
+
+    pub(super) fn action(&mut self, mean: &[f32; ACTION_LEN], std: &[f32; ACTION_LEN]) -> [f32; ACTION_LEN] {
+        match &mut self.rng {
+            None => *mean,
+            Some(rng) => std::array::from_fn(|i| mean[i] + std[i] * gaussian(rng)),
+        }
+    }
+}
+
+/// Standard Gumbel: `-ln(-ln u)` with u in (0, 1).
+fn gumbel(rng: &mut ChaCha8Rng) -> f32 {
+    -(-uniform(rng).ln()).ln() as f32
+}
+
+/// Standard normal (Box and Muller).
+fn gaussian(rng: &mut ChaCha8Rng) -> f32 {
+    let radius = (-2.0 * uniform(rng).ln()).sqrt();
+    (radius * (std::f64::consts::TAU * uniform(rng)).cos()) as f32
+}
+
+/// Uniform in the open interval (0, 1): the middle of one of 2^52 equal steps.
+fn uniform(rng: &mut ChaCha8Rng) -> f64 {
+    ((rng.random::<u64>() >> 12) as f64 + 0.5) / (1_u64 << 52) as f64
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use rcwm_models::settings::{ModelKind, Preset};
+
+    fn source(sampling: Sampling) -> NoiseSource {
+        NoiseSource::new(sampling, &ModelSettings::preset(Preset::Paper, ModelKind::Rcwm))
+    }
+
+    #[test]
+    fn the_mode_has_no_noise_and_acts_with_the_mean() {
+        let mut noise = source(Sampling::Mode);
+        noise.draw();
+        assert!(noise.robot().iter().chain(noise.environment()).all(|x| *x == 0.0));
+        assert_eq!(noise.action(&[0.5; 4], &[1.0; 4]), [0.5; 4]);
+    }
+
+    #[test]
+    fn samples_repeat_with_their_seed_and_have_the_right_moments() {
+        let (mut a, mut b) = (source(Sampling::Sample { seed: 7 }), source(Sampling::Sample { seed: 7 }));
+        (a.draw(), b.draw());
+        assert_eq!(a.robot(), b.robot());
+        assert_eq!(a.action(&[0.0; 4], &[1.0; 4]), b.action(&[0.0; 4], &[1.0; 4]));
+        let mut rng = ChaCha8Rng::seed_from_u64(1);
+        let count = 200_000;
+        // A standard Gumbel has mean 0.5772 and variance pi^2 / 6.
+        let draws: Vec<f64> = (0..count).map(|_| f64::from(gumbel(&mut rng))).collect();
+        let mean = draws.iter().sum::<f64>() / f64::from(count);
+        let variance = draws.iter().map(|x| (x - mean).powi(2)).sum::<f64>() / f64::from(count);
+        assert!((mean - 0.5772).abs() < 0.01 && (variance - 1.6449).abs() < 0.03, "{mean} {variance}");
+        let square =
+            (0..count).map(|_| f64::from(gaussian(&mut rng)).powi(2)).sum::<f64>() / f64::from(count);
+        assert!((square - 1.0).abs() < 0.02, "{square}");
+    }
+}

@@ -1,0 +1,260 @@
+//! A bundle against its golden values.
+//!
+//! **Parts.** Every part alone, on the inputs the trainer had (teacher forcing): largest absolute error of each output; classes
+//! must be the same.
+//!
+//! **Tick.** The whole tick, over all golden ticks, carrying its own state. Classes must be the same and actions within
+//! [`ACTION_TOLERANCE`]. A class may flip where the trainer's own two best were nearly equal: every flip is listed with its margin,
+//! one with a margin of at most [`FLIP_MARGIN_MAX`] is accepted, and the run goes on from the trainer's state so that later
+//! ticks are still compared.
+
+mod golden;
+mod parts;
+mod recurrent;
+
+use std::path::PathBuf;
+
+use rcwm_models::bundle::{Bundle, PartName};
+use rcwm_models::tensors::TensorsError;
+use serde::Serialize;
+
+use crate::engine::{self, EngineError, EngineKind, EngineSettings};
+use crate::policy::PolicyError;
+use golden::Golden;
+
+/// Largest error of an action over the recurrent run.
+pub const ACTION_TOLERANCE: f32 = 1e-4;
+/// Largest margin between the two best classes for a flip to count as a tie.
+pub const FLIP_MARGIN_MAX: f32 = 1e-4;
+
+/// Why a bundle could not be verified.
+#[derive(Debug, thiserror::Error)]
+pub enum VerifyError {
+    /// A golden value is missing or has the wrong type or size.
+    #[error("{file}: {source}; export the bundle again")]
+    Golden {
+        /// The file.
+        file: PathBuf,
+        /// What is wrong.
+        source: TensorsError,
+    },
+    /// An engine failed.
+    #[error(transparent)]
+    Engine(#[from] EngineError),
+    /// The policy failed.
+    #[error(transparent)]
+    Policy(#[from] PolicyError),
+}
+
+/// The error of one output over all ticks.
+#[derive(Debug, Clone, PartialEq, Serialize)]
+pub struct OutputError {
+    /// Name of the output.
+    pub output: String,
+    /// Ticks compared.
+    pub ticks: usize,
+    /// Largest absolute error; for classes the number of those that differ.
+    pub error_max: f32,
+    /// Whether it counts classes.
+    pub classes: bool,
+}
+
+/// A class that is another than the trainer's.
+#[derive(Debug, Clone, PartialEq, Serialize)]
+pub struct Flip {
+    /// The tick.
+    pub tick: usize,
+    /// `robot` or `environment`.
+    pub branch: PartName,
+    /// `prior_z` or `posterior_z`.
+    pub output: &'static str,
+    /// Which of the n categoricals.
+    pub categorical: usize,
+    /// The trainer's class.
+    pub expected: i64,
+    /// The engine's class.
+    pub found: i64,
+    /// Difference of the trainer's two best scores.
+    pub margin: f32,
+    /// It follows from an earlier flip of the same tick.
+    pub follows: bool,
+}
+
+impl Flip {
+    /// Whether the classes were too close to tell.
+    #[must_use]
+    pub fn is_tie(&self) -> bool {
+        self.follows || self.margin <= FLIP_MARGIN_MAX
+    }
+}
+
+/// One part alone.
+#[derive(Debug, Clone, PartialEq, Serialize)]
+pub struct PartReport {
+    /// The part.
+    pub part: PartName,
+    /// Its outputs.
+    pub outputs: Vec<OutputError>,
+    /// Classes that differ.
+    pub flips: Vec<Flip>,
+}
+
+/// The whole tick.
+#[derive(Debug, Clone, PartialEq, Serialize)]
+pub struct RecurrentReport {
+    /// Ticks run.
+    pub ticks: usize,
+    /// Ticks without a flip, over which the errors below are taken.
+    pub ticks_compared: usize,
+    /// Largest error of the mean action.
+    pub mean_error_max: f32,
+    /// Largest error of the action's standard deviation.
+    pub std_error_max: f32,
+    /// Largest error of h, both branches.
+    pub h_error_max: f32,
+    /// Classes that differ.
+    pub flips: Vec<Flip>,
+}
+
+/// One engine.
+#[derive(Debug, Clone, PartialEq, Serialize)]
+pub struct EngineReport {
+    /// The engine.
+    pub engine: EngineKind,
+    /// Every part of the bundle that has golden values.
+    pub parts: Vec<PartReport>,
+    /// Parts without golden values.
+    pub unchecked_parts: Vec<PartName>,
+    /// The whole tick.
+    pub recurrent: RecurrentReport,
+    /// What is wrong, one line each; empty when all is well.
+    pub failures: Vec<String>,
+}
+
+/// Verifies a bundle on one engine. `progress` is called with every unit of work done, of [`work_units`].
+///
+/// # Errors
+/// See [`VerifyError`]. Differences are no errors but [`EngineReport::failures`].
+pub fn verify(
+    bundle: &Bundle,
+    kind: EngineKind,
+    tolerance: f32,
+    progress: &mut dyn FnMut(),
+) -> Result<EngineReport, VerifyError> {
+    let golden = Golden::of(bundle)?;
+    let settings = EngineSettings::single_threaded(kind);
+    engine::available(kind)?;
+    let (mut parts, mut unchecked_parts) = (Vec::new(), Vec::new());
+    let mut checker = parts::Checker::new(bundle, &golden, settings)?;
+    for part in PartName::ALL.into_iter().filter(|part| bundle.part(*part).is_some()) {
+        if golden.has(part) || PartName::REQUIRED.contains(&part) {
+            parts.push(checker.check(part, progress)?);
+        } else {
+            unchecked_parts.push(part);
+        }
+    }
+    let recurrent = recurrent::run(bundle, &golden, settings, progress)?;
+    let failures = failures(&parts, &recurrent, tolerance);
+    Ok(EngineReport { engine: kind, parts, unchecked_parts, recurrent, failures })
+}
+
+/// Units of work of [`verify`] on one engine.
+///
+/// # Errors
+/// [`VerifyError::Golden`].
+pub fn work_units(bundle: &Bundle) -> Result<usize, VerifyError> {
+    let ticks = Golden::of(bundle)?.ticks;
+    Ok(ticks * (bundle.parts.len() + 1))
+}
+
+fn failures(parts: &[PartReport], recurrent: &RecurrentReport, tolerance: f32) -> Vec<String> {
+    let mut failures = Vec::new();
+    for part in parts {
+        for output in part.outputs.iter().filter(|output| !output.classes) {
+            // Written so that NaN fails.
+            if !(output.error_max <= tolerance) {
+                let OutputError { output, error_max, .. } = output;
+                failures.push(format!(
+                    "{}: {output} is {error_max:.2e} off, accepted is {tolerance:.0e}",
+                    part.part
+                ));
+            }
+        }
+        failures.extend(clear_flips(&format!("{} alone", part.part), &part.flips));
+    }
+    failures.extend(clear_flips("recurrent run", &recurrent.flips));
+    for (what, error) in [("mean", recurrent.mean_error_max), ("std", recurrent.std_error_max)] {
+        if !(error <= ACTION_TOLERANCE) {
+            failures.push(format!(
+                "recurrent run: the action's {what} is {error:.2e} off, accepted is {ACTION_TOLERANCE:.0e}"
+            ));
+        }
+    }
+    failures
+}
+
+fn clear_flips(where_: &str, flips: &[Flip]) -> Option<String> {
+    let clear: Vec<_> = flips.iter().filter(|flip| !flip.is_tie()).collect();
+    let worst = clear.iter().max_by(|a, b| a.margin.total_cmp(&b.margin))?;
+    Some(format!(
+        "{where_}: {} classes differ that are no ties (largest margin {:.2e} at tick {}, {} {})",
+        clear.len(),
+        worst.margin,
+        worst.tick,
+        worst.branch,
+        worst.output
+    ))
+}
+
+impl EngineReport {
+    /// The report for people.
+    #[must_use]
+    pub fn text(&self) -> String {
+        let mut text = format!("engine {}\n", self.engine);
+        for part in &self.parts {
+            let outputs: Vec<_> = part.outputs.iter().map(OutputError::text).collect();
+            text += &format!("  {:<12} {}\n", part.part.as_str(), outputs.join("  "));
+        }
+        if !self.unchecked_parts.is_empty() {
+            text += &format!("  no golden values: {:?}\n", self.unchecked_parts);
+        }
+        let r = &self.recurrent;
+        text += &format!(
+            "  {:<12} {} ticks, {} without a flip; mean {:.1e}  std {:.1e}  h {:.1e}\n",
+            "whole tick", r.ticks, r.ticks_compared, r.mean_error_max, r.std_error_max, r.h_error_max
+        );
+        for flip in self.parts.iter().flat_map(|part| &part.flips) {
+            text += &flip.text("alone");
+        }
+        for flip in &r.flips {
+            text += &flip.text("recurrent");
+        }
+        text
+    }
+}
+
+impl OutputError {
+    fn text(&self) -> String {
+        let Self { output, error_max, ticks, classes } = self;
+        if *classes {
+            format!("{output} {error_max:.0} differ/{ticks}")
+        } else {
+            format!("{output} {error_max:.1e}/{ticks}")
+        }
+    }
+}
+
+impl Flip {
+    fn text(&self, run: &str) -> String {
+        let Self { tick, branch, output, categorical, expected, found, margin, .. } = self;
+        let verdict = match (self.follows, self.is_tie()) {
+            (true, _) => "follows from the flip before",
+            (false, true) => "tie",
+            (false, false) => "NOT A TIE",
+        };
+        format!(
+            "  flip ({run}) tick {tick} {branch} {output}[{categorical}]: {expected} -> {found}, margin {margin:.1e}, \
+             {verdict}\n"
+        )
+    }
+}

@@ -1,0 +1,70 @@
+//! The whole tick, carrying its own state.
+
+use rcwm_models::bundle::{Bundle, PartName};
+
+use super::golden::{BRANCHES, Golden};
+use super::parts::{error_max, note_flips, worst};
+use super::{Flip, RecurrentReport, VerifyError};
+use crate::engine::EngineSettings;
+use crate::policy::{Buffers, Policy, Sampling};
+
+pub(super) fn run(
+    bundle: &Bundle,
+    golden: &Golden<'_>,
+    settings: EngineSettings,
+    progress: &mut dyn FnMut(),
+) -> Result<RecurrentReport, VerifyError> {
+    let mut policy = Policy::new(bundle, settings, Sampling::Mode)?;
+    let mut report = RecurrentReport {
+        ticks: golden.ticks,
+        ticks_compared: 0,
+        mean_error_max: 0.0,
+        std_error_max: 0.0,
+        h_error_max: 0.0,
+        flips: Vec::new(),
+    };
+    for tick in 0..golden.ticks {
+        progress();
+        policy.set_noise(golden.noise(PartName::Robot, tick)?, golden.noise(PartName::Environment, tick)?)?;
+        policy.observe(golden.image(tick)?, &golden.action(tick)?, golden.is_first(tick)?)?;
+        let flips = flips_of(golden, policy.buffers(), tick)?;
+        if flips.is_empty() {
+            report.compare(golden, policy.buffers(), tick)?;
+        } else {
+            // The state would go its own way from here: go on from the trainer's, so that later ticks still tell something.
+            policy.set_state(&golden.state_after(tick)?)?;
+            report.flips.extend(flips);
+        }
+    }
+    Ok(report)
+}
+
+/// The tick's flips, in the order they happen; what comes after the first may follow from it.
+fn flips_of(golden: &Golden<'_>, buffers: &Buffers, tick: usize) -> Result<Vec<Flip>, VerifyError> {
+    let mut flips = Vec::new();
+    for (branch, found) in BRANCHES.into_iter().zip([&buffers.robot, &buffers.environment]) {
+        // Only the robot's prior is used within the tick: through the interaction it moves the environment (eq. 7).
+        let prior_moved = flips.iter().any(|flip: &Flip| flip.output == "prior_z");
+        let before = flips.len();
+        note_flips(golden, branch, 0, tick, &found.prior_z, &mut flips)?;
+        note_flips(golden, branch, 1, tick, &found.posterior_z, &mut flips)?;
+        for flip in &mut flips[before..] {
+            flip.follows = prior_moved;
+        }
+    }
+    Ok(flips)
+}
+
+impl RecurrentReport {
+    fn compare(&mut self, golden: &Golden<'_>, found: &Buffers, tick: usize) -> Result<(), VerifyError> {
+        let actor = |output| golden.expect_f32(PartName::Actor, output, tick);
+        self.ticks_compared += 1;
+        self.mean_error_max = worst(self.mean_error_max, error_max(&found.mean, actor("mean")?));
+        self.std_error_max = worst(self.std_error_max, error_max(&found.std, actor("std")?));
+        for (branch, found) in BRANCHES.into_iter().zip([&found.robot, &found.environment]) {
+            let expected = golden.expect_f32(branch, "h_next", tick)?;
+            self.h_error_max = worst(self.h_error_max, error_max(&found.h_next, expected));
+        }
+        Ok(())
+    }
+}
