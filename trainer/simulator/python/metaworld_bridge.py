@@ -8,6 +8,7 @@ import copy
 import ctypes
 import ctypes.util
 import os
+import threading
 import warnings
 
 import numpy as np
@@ -44,6 +45,9 @@ def choose_renderer():
     load_library("EGL" if backend == "egl" else "OSMesa")
 
 
+# This interpreter does not heed them, but a package (glfw) starts another one as a child.
+for variable in ("PYTHONHOME", "PYTHONPATH"):
+    os.environ.pop(variable, None)
 choose_renderer()
 import fast_simplification  # noqa: E402  the renderer must be chosen before MuJoCo is imported
 import metaworld  # noqa: E402
@@ -152,8 +156,9 @@ class Camera:
     multisampling, and the robot's meshes with a fifth of their triangles.
     """
 
-    # The camera whose graphics context is current: drawing into another one gives black pictures and no error.
-    current = None
+    # The camera whose graphics context is current in a thread: drawing into another gives black pictures and no error.
+    # Making it current for every picture would cost a tenth of it.
+    current = threading.local()
 
     def __init__(self, model, data, faithful):
         self.model, self.data = model, data
@@ -222,12 +227,12 @@ class Camera:
         self.make_current()
         self.context.free()
         self.gl.free()
-        Camera.current = None
+        Camera.current.camera = None
 
     def make_current(self):
-        if Camera.current is not self:
+        if getattr(Camera.current, "camera", None) is not self:
             self.gl.make_current()
-            Camera.current = self
+            Camera.current.camera = self
 
     def _draw(self, pixels):
         self.make_current()
@@ -250,9 +255,10 @@ def simplify_meshes(model, meshes):
     for mesh in meshes:
         vertices = slice(model.mesh_vertadr[mesh], model.mesh_vertadr[mesh] + model.mesh_vertnum[mesh])
         faces = slice(model.mesh_faceadr[mesh], model.mesh_faceadr[mesh] + model.mesh_facenum[mesh])
-        points, corners = fast_simplification.simplify(
-            np.array(model.mesh_vert[vertices]), np.array(model.mesh_face[faces]), 1 - MESH_SHARE
-        )
+        # Points that lie in one place become one, or cracks open between the patches of a surface.
+        points, place = np.unique(model.mesh_vert[vertices], axis=0, return_inverse=True)
+        corners = place[model.mesh_face[faces]].astype(np.int32)
+        points, corners = fast_simplification.simplify(points, corners, 1 - MESH_SHARE)
         normals = vertex_normals(points, corners)
         write(model.mesh_vert, model.mesh_vertadr, model.mesh_vertnum, mesh, points)
         write(model.mesh_normal, model.mesh_normaladr, model.mesh_normalnum, mesh, normals)

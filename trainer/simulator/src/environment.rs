@@ -1,5 +1,7 @@
 //! One Meta-World task, in the embedded interpreter.
 
+use std::marker::PhantomData;
+
 use clap::ValueEnum;
 use pyo3::buffer::PyBuffer;
 use pyo3::call::PyCallArgs;
@@ -55,6 +57,8 @@ pub struct Environment {
     /// Reward, success, proprioception.
     facts: PyBuffer<f32>,
     expert_action: PyBuffer<f32>,
+    /// A graphics context belongs to the thread that made it.
+    not_send: PhantomData<*const ()>,
 }
 
 impl Environment {
@@ -76,7 +80,7 @@ impl Environment {
             let facts = array(&object, "facts").map_err(failed)?;
             let expert_action = array(&object, "expert_action").map_err(failed)?;
             let object = object.unbind();
-            Ok(Self { task_id, object, image, mask, facts, expert_action, settings })
+            Ok(Self { task_id, object, image, mask, facts, expert_action, settings, not_send: PhantomData })
         })
     }
 

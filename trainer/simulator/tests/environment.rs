@@ -1,0 +1,183 @@
+//! Meta-World itself: layouts, pictures, masks, disturbances.
+
+use rcwm_models::tasks::TASKS;
+use rcwm_models::wire::Observation;
+use rcwm_models::{ACTION_LEN, IMAGE_SIDE};
+use rcwm_simulator::SimulatorError;
+use rcwm_simulator::environment::{
+    Disturbance, Environment, EnvironmentSettings, STEPS_MAX, installed_tasks,
+};
+use rcwm_simulator::policy::{Policy, Script};
+
+fn settings(task: &str) -> EnvironmentSettings {
+    let task = task.to_owned();
+    EnvironmentSettings { task, seed: 3, faithful: false, masks: true, disturb: Disturbance::None }
+}
+
+fn see(environment: &Environment) -> (Observation, bool) {
+    let mut observation = Observation::zeroed();
+    let solved = environment.write_to(&mut observation).unwrap();
+    assert!(observation.is_finite());
+    (observation, solved)
+}
+
+/// The first observation of an episode, and those after each of some seeded random actions.
+fn watch(environment: &Environment, episode: u64, steps: u32) -> Vec<Observation> {
+    environment.reset(episode).unwrap();
+    let mut script = Script::new(Policy::Random, 9, episode);
+    let mut seen = vec![see(environment).0];
+    for _ in 0..steps {
+        environment.step(script.decide(environment).unwrap().unwrap()).unwrap();
+        seen.push(see(environment).0);
+    }
+    seen
+}
+
+fn numbers(observation: &Observation) -> (u32, [u32; 18]) {
+    (observation.reward.to_bits(), observation.proprioception.map(f32::to_bits))
+}
+
+fn same(a: &Observation, b: &Observation) -> bool {
+    numbers(a) == numbers(b) && a.image == b.image && a.robot_mask == b.robot_mask
+}
+
+fn share(mask: impl Iterator<Item = bool>) -> f64 {
+    let mask: Vec<bool> = mask.collect();
+    mask.iter().filter(|set| **set).count() as f64 / mask.len() as f64
+}
+
+#[test]
+fn the_tasks_on_the_wire_are_those_of_meta_world() {
+    assert_eq!(installed_tasks().unwrap(), TASKS);
+}
+
+#[test]
+fn an_unknown_task_is_refused_with_near_names() {
+    let error = Environment::open(settings("hamer")).err().unwrap();
+    assert!(matches!(error, SimulatorError::UnknownTask(_)));
+    assert!(error.to_string().contains("hammer"), "{error}");
+}
+
+#[test]
+fn an_episode_depends_on_its_number_and_not_on_the_ones_before() {
+    let (one, other) = (Environment::open(settings("hammer")), Environment::open(settings("hammer")));
+    let (one, other) = (one.unwrap(), other.unwrap());
+    let first = watch(&one, 0, 10);
+    let third = watch(&one, 2, 10);
+    let alone = watch(&other, 2, 10);
+    assert!(
+        third.iter().zip(&alone).all(|(a, b)| same(a, b)),
+        "an episode differs when another one came before"
+    );
+    assert_ne!(first[0].image, third[0].image, "two episodes have the same layout");
+    assert!(watch(&one, 0, 10).iter().zip(&first).all(|(a, b)| same(a, b)), "a repeated episode differs");
+}
+
+#[test]
+fn the_fast_picture_has_the_physics_of_the_faithful_one_and_nearly_its_mask() {
+    let fast = Environment::open(settings("hammer")).unwrap();
+    let faithful = Environment::open(EnvironmentSettings { faithful: true, ..settings("hammer") }).unwrap();
+    let (fast, faithful) = (watch(&fast, 0, 30), watch(&faithful, 0, 30));
+    for (a, b) in fast.iter().zip(&faithful) {
+        assert_eq!(numbers(a), numbers(b));
+    }
+    let (fast, faithful) = (fast[30], faithful[30]);
+    let pairs = || fast.robot_mask.iter().zip(&faithful.robot_mask);
+    let both = share(pairs().map(|(a, b)| a & b == 255));
+    let any = share(pairs().map(|(a, b)| a | b == 255));
+    assert!(both / any > 0.97, "intersection over union {}", both / any);
+    let difference: u64 =
+        fast.image.iter().zip(&faithful.image).map(|(a, b)| u64::from(a.abs_diff(*b))).sum();
+    let mean = difference as f64 / fast.image.len() as f64;
+    assert!(mean > 0.0 && mean < 20.0, "mean difference of a colour {mean}");
+}
+
+#[test]
+fn the_picture_is_upright_and_the_mask_covers_the_arm() {
+    let environment = Environment::open(settings("reach")).unwrap();
+    environment.reset(0).unwrap();
+    let (observation, _) = see(&environment);
+    let pixel = |x: usize, y: usize| -> [u8; 3] {
+        std::array::from_fn(|channel| observation.image[3 * (y * IMAGE_SIDE + x) + channel])
+    };
+    let [red, green, blue] = pixel(2, 2).map(i32::from);
+    assert!((red - blue).abs() < 20 && (green - blue).abs() < 20, "grey sky above, found {:?}", pixel(2, 2));
+    let [red, _, blue] = pixel(12, 58).map(i32::from);
+    assert!(red - blue > 15, "brown table below, found {:?}", pixel(12, 58));
+
+    assert!(observation.robot_mask.iter().all(|value| matches!(value, 0 | 255)));
+    let covered = share(observation.robot_mask.iter().map(|value| *value == 255));
+    assert!((0.05..0.4).contains(&covered), "the mask covers {covered}");
+    // The arm is red, nothing else in this layout is: every clearly red pixel above the table's middle belongs to it.
+    for y in 0..20 {
+        for x in 30..IMAGE_SIDE {
+            let [red, green, _] = pixel(x, y).map(i32::from);
+            let masked = observation.robot_mask[y * IMAGE_SIDE + x] == 255;
+            assert!(masked || red - green < 60, "red pixel {x}, {y} is not in the mask");
+            assert!(!masked || (x, y) != (2, 2));
+        }
+    }
+}
+
+#[test]
+fn the_mask_is_empty_unless_asked_for() {
+    let environment = Environment::open(EnvironmentSettings { masks: false, ..settings("reach") }).unwrap();
+    assert!(watch(&environment, 0, 1)[1].robot_mask.iter().all(|value| *value == 0));
+}
+
+#[test]
+fn the_expert_solves_the_task_and_proprioception_stays_in_range() {
+    let environment =
+        Environment::open(EnvironmentSettings { masks: false, ..settings("button-press") }).unwrap();
+    environment.reset(0).unwrap();
+    let mut script = Script::new(Policy::Expert, 0, 0);
+    let (mut ever, mut moved) = (false, false);
+    for _ in 0..80 {
+        environment.step(script.decide(&environment).unwrap().unwrap()).unwrap();
+        let (observation, solved) = see(&environment);
+        ever |= solved;
+        let (positions, velocities) = observation.proprioception.split_at(9);
+        assert!(positions.iter().all(|x| x.abs() < 1.1), "joint position out of range: {positions:?}");
+        assert!(velocities.iter().all(|x| x.abs() < 30.0), "joint velocity out of range: {velocities:?}");
+        moved |= velocities.iter().any(|x| x.abs() > 0.05);
+        assert!(
+            (0.0..=20.0).contains(&observation.reward),
+            "two rewards of at most 10: {}",
+            observation.reward
+        );
+    }
+    assert!(ever && moved);
+}
+
+#[test]
+fn an_episode_has_no_step_beyond_its_last() {
+    let environment = Environment::open(EnvironmentSettings { masks: false, ..settings("reach") }).unwrap();
+    environment.reset(0).unwrap();
+    for _ in 0..STEPS_MAX {
+        environment.step([0.0; ACTION_LEN]).unwrap();
+    }
+    assert!(matches!(environment.step([0.0; ACTION_LEN]), Err(SimulatorError::Python { .. })));
+}
+
+#[test]
+fn disturbances_change_the_picture_but_neither_robot_nor_physics() {
+    let plain = Environment::open(settings("coffee-pull")).unwrap();
+    let plain = watch(&plain, 1, 3);
+    for disturb in [Disturbance::Textures, Disturbance::Noise] {
+        let environment =
+            Environment::open(EnvironmentSettings { disturb, ..settings("coffee-pull") }).unwrap();
+        let disturbed = watch(&environment, 1, 3);
+        assert!(watch(&environment, 1, 3).iter().zip(&disturbed).all(|(a, b)| same(a, b)), "not repeatable");
+        for (a, b) in plain.iter().zip(&disturbed) {
+            assert_eq!(numbers(a), numbers(b));
+            assert_eq!(a.robot_mask, b.robot_mask);
+            let pixels = || a.image.chunks(3).zip(b.image.chunks(3)).zip(&a.robot_mask);
+            let robot = share(pixels().filter(|(_, mask)| **mask == 255).map(|((a, b), _)| a == b));
+            let rest = share(pixels().filter(|(_, mask)| **mask == 0).map(|((a, b), _)| a == b));
+            assert!(
+                robot > 0.97 && rest < 0.9,
+                "{disturb:?}: unchanged {robot} of the robot, {rest} of the rest"
+            );
+        }
+    }
+}
