@@ -1,5 +1,6 @@
 //! The command line, one file per verb.
 
+mod export;
 mod init;
 mod parameters;
 mod parity;
@@ -25,6 +26,7 @@ enum Verb {
     Parameters(parameters::Parameters),
     Parity(parity::Parity),
     Init(init::Init),
+    Export(export::Export),
 }
 
 impl Arguments {
@@ -34,6 +36,7 @@ impl Arguments {
             Verb::Parameters(verb) => verb.run(),
             Verb::Parity(verb) => verb.run(),
             Verb::Init(verb) => verb.run(),
+            Verb::Export(verb) => verb.run(),
         }
     }
 }

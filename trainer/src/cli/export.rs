@@ -1,0 +1,151 @@
+use std::io::IsTerminal;
+use std::path::PathBuf;
+use std::process::ExitCode;
+use std::sync::Arc;
+use std::sync::atomic::{AtomicBool, Ordering};
+
+use anyhow::{Context, Result};
+use candle_core::Device;
+use clap::ValueEnum;
+use indicatif::{ProgressBar, ProgressStyle};
+use rcwm_models::bundle::{Bundle, PartName};
+use rcwm_models::tasks;
+use rcwm_trainer::checkpoint::Checkpoint;
+use rcwm_trainer::export::{self, ExportError, Options, Progress};
+use serde::Serialize;
+
+/// Export a checkpoint as a bundle that a runtime deploys
+#[derive(Debug, clap::Args)]
+#[command(after_help = "Examples:
+  rcwm-trainer export --checkpoint runs/untrained --out bundles/untrained
+  rcwm-trainer export --checkpoint runs/hammer --out bundles/hammer --task hammer --golden-episode episode.npz --force")]
+pub struct Export {
+    /// Folder of the checkpoint
+    #[arg(long, value_name = "DIR")]
+    checkpoint: PathBuf,
+    /// Folder of the bundle
+    #[arg(long, value_name = "BUNDLE")]
+    out: PathBuf,
+    /// Task the policy was made for, one of Meta-World's or `own`
+    #[arg(long, default_value = "own")]
+    task: String,
+    /// Which parts: all, or only those without which there is no policy
+    #[arg(long, value_enum, default_value = "all")]
+    parts: Parts,
+    /// Decisions a second the policy was trained for
+    #[arg(long, default_value_t = 40.0)]
+    rate_hz: f64,
+    /// Make the golden values from the images of this episode (.npz) instead of synthetic ones
+    #[arg(long, value_name = "FILE")]
+    golden_episode: Option<PathBuf>,
+    /// Ticks of golden values, at most
+    #[arg(long, default_value_t = 32)]
+    golden_ticks: usize,
+    /// Seed of the golden noise
+    #[arg(long, default_value_t = 0)]
+    golden_seed: u64,
+    /// Replace a bundle that is there
+    #[arg(long)]
+    force: bool,
+    /// Write what was exported as JSON
+    #[arg(long, value_name = "FILE")]
+    json: Option<PathBuf>,
+}
+
+#[derive(Debug, Clone, Copy, ValueEnum)]
+enum Parts {
+    /// Every part, with reward, continue and decoder.
+    All,
+    /// Encoder, robot, interaction, environment, actor.
+    Required,
+}
+
+#[derive(Serialize)]
+struct Outcome<'a> {
+    bundle: &'a PathBuf,
+    bytes: u64,
+    golden_bytes: u64,
+    parts: Vec<PartSize<'a>>,
+}
+
+#[derive(Serialize)]
+struct PartSize<'a> {
+    name: &'a str,
+    bytes: u64,
+}
+
+impl Export {
+    pub fn run(self) -> Result<ExitCode> {
+        if self.task != tasks::task_name(tasks::OWN_TASK) {
+            tasks::task_id(&self.task).with_context(|| "--task")?;
+        }
+        let checkpoint = Checkpoint::read(&self.checkpoint, &Device::Cpu)?;
+        let options = Options {
+            task: self.task.clone(),
+            rate_hz: self.rate_hz,
+            parts: match self.parts {
+                Parts::All => PartName::ALL.to_vec(),
+                Parts::Required => PartName::REQUIRED.to_vec(),
+            },
+            golden_episode: self.golden_episode.clone(),
+            golden_ticks: self.golden_ticks,
+            golden_seed: self.golden_seed,
+            source_revision: env!("RCWM_SOURCE_REVISION").to_owned(),
+            replace: self.force,
+        };
+        let bar = Bar::new()?;
+        let bundle = export::write(&checkpoint, &self.out, &options, &bar);
+        bar.bar.finish_and_clear();
+        self.summarise(&bundle?)?;
+        Ok(ExitCode::SUCCESS)
+    }
+
+    fn summarise(&self, bundle: &Bundle) -> Result<()> {
+        let manifest = &bundle.manifest;
+        let parts = manifest.parts.iter().map(|part| PartSize { name: part.name.as_str(), bytes: part.bytes });
+        let outcome = Outcome {
+            bundle: &self.out,
+            bytes: manifest.parts.iter().map(|part| part.bytes).sum(),
+            golden_bytes: manifest.golden.bytes,
+            parts: parts.collect(),
+        };
+        for part in &outcome.parts {
+            println!("{:<12} {:>8.2} MB", part.name, part.bytes as f64 / 1e6);
+        }
+        println!("{:<12} {:>8.2} MB, {}", "golden", outcome.golden_bytes as f64 / 1e6, manifest.provenance.data);
+        println!("bundle in {}", self.out.display());
+        match &self.json {
+            Some(path) => super::write_json(path, &outcome),
+            None => Ok(()),
+        }
+    }
+}
+
+/// A progress bar that Ctrl-C stops.
+struct Bar {
+    bar: ProgressBar,
+    interrupted: Arc<AtomicBool>,
+}
+
+impl Bar {
+    fn new() -> Result<Self> {
+        let bar = if std::io::stderr().is_terminal() { ProgressBar::new(0) } else { ProgressBar::hidden() };
+        bar.set_style(ProgressStyle::with_template("{msg:<32} {bar:30} {pos}/{len}")?);
+        let interrupted = Arc::new(AtomicBool::new(false));
+        let flag = interrupted.clone();
+        ctrlc::set_handler(move || flag.store(true, Ordering::Relaxed)).context("listening for Ctrl-C")?;
+        Ok(Self { bar, interrupted })
+    }
+}
+
+impl Progress for Bar {
+    fn step(&self, what: &str, done: usize, total: usize) -> Result<(), ExportError> {
+        if self.interrupted.load(Ordering::Relaxed) {
+            return Err(ExportError::Interrupted);
+        }
+        self.bar.set_length(total as u64);
+        self.bar.set_position(done as u64);
+        self.bar.set_message(what.to_owned());
+        Ok(())
+    }
+}

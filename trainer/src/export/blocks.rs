@@ -1,0 +1,127 @@
+//! The model's building blocks as graphs. Names are those of the parameters.
+
+use ndarray::{Array2, ArrayD, concatenate, Axis};
+use rcwm_models::settings::ModelSettings;
+
+use super::graph::{Graph, Value};
+use super::weights::Weights;
+use crate::model::layers::NORM_EPS;
+
+/// A graph with the weights and sizes that go into it.
+pub struct Part<'a> {
+    pub graph: Graph,
+    pub weights: &'a Weights,
+    pub settings: &'a ModelSettings,
+}
+
+/// A state [1, n] of class indices and [1, d], of both branches.
+pub struct StateInputs {
+    pub z: [Value; 2],
+    pub h: [Value; 2],
+}
+
+impl Part<'_> {
+    /// A parameter as it is.
+    pub fn parameter(&mut self, name: &str) -> Value {
+        self.array(name, self.weights.get(name))
+    }
+
+    /// A constant array.
+    pub fn array(&mut self, name: &str, array: &ArrayD<f32>) -> Value {
+        let values: Vec<f32> = array.iter().copied().collect();
+        self.graph.floats(name, array.shape(), &values)
+    }
+
+    /// A constant matrix.
+    pub fn matrix(&mut self, name: &str, matrix: Array2<f32>) -> Value {
+        self.array(name, &matrix.into_dyn())
+    }
+
+    /// `x W^T + b` with the layer `name`.
+    pub fn linear(&mut self, name: &str, x: &Value) -> Value {
+        let weight = self.matrix(&format!("{name}.weight"), self.weights.matrix(&format!("{name}.weight")));
+        let product = self.graph.matmul(x, &weight);
+        let bias = self.parameter(&format!("{name}.bias"));
+        self.graph.add(&product, &bias)
+    }
+
+    /// The share of inputs `[from, from + width)` in the product with `name`.weight.
+    pub fn linear_share(&mut self, name: &str, x: &Value, from: usize) -> Value {
+        let width = x.shape()[x.shape().len() - 1];
+        let rows = self.weights.rows(&format!("{name}.weight"), from, width);
+        let rows = self.matrix(&format!("{name}.weight.from_{from}"), rows);
+        self.graph.matmul(x, &rows)
+    }
+
+    /// LayerNorm with the layer `name`.
+    pub fn norm(&mut self, name: &str, x: &Value, eps: f64) -> Value {
+        let weight = self.parameter(&format!("{name}.weight"));
+        let bias = self.parameter(&format!("{name}.bias"));
+        self.graph.layer_norm(x, &weight, &bias, eps)
+    }
+
+    /// What follows the linear layer of a dense block.
+    pub fn norm_silu(&mut self, name: &str, x: &Value) -> Value {
+        let normed = self.norm(name, x, NORM_EPS);
+        self.graph.silu(&normed)
+    }
+
+    /// LayerNorm over the channels of [1, C, H, W], then `SiLU`.
+    pub fn channel_norm_silu(&mut self, name: &str, x: &Value) -> Value {
+        let last = self.graph.transpose(x, &[0, 2, 3, 1]);
+        let active = self.norm_silu(name, &last);
+        self.graph.transpose(&active, &[0, 3, 1, 2])
+    }
+
+    /// A dense block on a plain input.
+    pub fn dense(&mut self, name: &str, x: &Value) -> Value {
+        let weight = format!("{name}.linear.weight");
+        let weight = self.matrix(&weight, self.weights.matrix(&weight));
+        let product = self.graph.matmul(x, &weight);
+        self.norm_silu(&format!("{name}.norm"), &product)
+    }
+
+    /// The product of one-hot rows with a weight: the sum of one row of `table` [latents * m, out] for each latent.
+    ///
+    /// `z` [1, latents] are class indices; latent i with class j is row i * m + j.
+    pub fn one_hot_product(&mut self, name: &str, z: &Value, table: Array2<f32>) -> Value {
+        let (latents, m) = (z.shape()[1], self.settings.classes);
+        let table = self.matrix(name, table);
+        let offsets: Vec<i64> = (0..latents).map(|latent| (latent * m) as i64).collect();
+        let offsets = self.graph.integers(&format!("offsets_{latents}"), &[1, latents], &offsets);
+        let index = self.graph.add(z, &offsets); // [1, latents]
+        let rows = self.graph.gather(&table, &index); // [1, latents, out]
+        self.graph.sum_over_1(&rows) // [1, out]
+    }
+
+    /// Declares the inputs of a part that reads the whole state.
+    pub fn state_inputs(&mut self, inputs: &[rcwm_models::bundle::TensorSpec]) -> StateInputs {
+        let values: Vec<Value> = inputs.iter().map(|spec| self.graph.input(spec)).collect();
+        let [robot_z, robot_h, environment_z, environment_h] =
+            <[Value; 4]>::try_from(values).expect("parts that read the state have its four inputs");
+        StateInputs { z: [robot_z, environment_z], h: [robot_h, environment_h] }
+    }
+
+    /// Two dense blocks and an output layer on the whole state.
+    pub fn head(&mut self, name: &str, state: &StateInputs) -> Value {
+        let (nm, s) = (self.settings.stoch_width(), self.settings.branch_width());
+        let weight = format!("{name}.0.linear.weight");
+        let d = self.settings.deter;
+        let rows = |from, count| self.weights.rows(&weight, from, count);
+        // The state is [z^R, h^R, z^E, h^E]; its z rows and its h rows are taken together.
+        let (z_rows, h_rows) = ([rows(0, nm), rows(s, nm)], [rows(nm, d), rows(s + nm, d)]);
+        let join = |rows: [Array2<f32>; 2]| {
+            concatenate(Axis(0), &[rows[0].view(), rows[1].view()]).expect("both have the head's width")
+        };
+        let (z_rows, h_rows) = (join(z_rows), join(h_rows));
+        let z = self.graph.concat(&[&state.z[0], &state.z[1]], 1); // [1, 2n]
+        let h = self.graph.concat(&[&state.h[0], &state.h[1]], 1); // [1, 2d]
+        let z_share = self.one_hot_product(&format!("{weight}.z"), &z, z_rows);
+        let h_rows = self.matrix(&format!("{weight}.h"), h_rows);
+        let h_share = self.graph.matmul(&h, &h_rows);
+        let sum = self.graph.add(&z_share, &h_share);
+        let x = self.norm_silu(&format!("{name}.0.norm"), &sum);
+        let x = self.dense(&format!("{name}.1"), &x);
+        self.linear(&format!("{name}.out"), &x)
+    }
+}

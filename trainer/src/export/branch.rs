@@ -1,0 +1,130 @@
+//! Robot and environment as graphs, each with its encoder.
+
+use rcwm_models::bundle::{PartName, TensorSpec};
+
+use super::blocks::Part;
+use super::graph::Value;
+use crate::model::layers::NORM_EPS;
+
+impl Part<'_> {
+    /// The shared encoder: image -> features.
+    pub fn encoder(&mut self) {
+        let (inputs, _) = PartName::Encoder.signature(self.settings);
+        let image = self.graph.input(&inputs[0]);
+        let x = self.graph.to_float(&image); // [1, 64, 64, 3]
+        let full = self.graph.scalar(255.0);
+        let x = self.graph.binary("Div", &x, &full);
+        let x = self.graph.shift(&x, -0.5);
+        let x = self.graph.transpose(&x, &[0, 3, 1, 2]);
+        let features = self.conv_stack("encoder.shared", x); // [1, 2c, 16, 16]
+        self.graph.output("features", &features);
+    }
+
+    /// The robot branch (eq. 5, 6 left): z, h, action, features, noise -> h', prior and posterior.
+    pub fn robot(&mut self) {
+        let (inputs, _) = PartName::Robot.signature(self.settings);
+        let [z, h, action, features, noise] = self.inputs(&inputs);
+        let nm = self.settings.stoch_width();
+        let weight = "robot.input.linear.weight";
+        let z_share = self.one_hot_product(&format!("{weight}.z"), &z, self.weights.rows(weight, 0, nm));
+        let action = self.normalised_action(&action);
+        let action_share = self.linear_share("robot.input.linear", &action, nm);
+        let sum = self.graph.add(&z_share, &action_share);
+        self.branch("robot", &sum, &h, &features, &noise);
+    }
+
+    /// The environment branch (eq. 5, 6 right): e, h, features, noise -> h', prior and posterior.
+    pub fn environment(&mut self) {
+        let (inputs, _) = PartName::Environment.signature(self.settings);
+        let [e, h, features, noise] = self.inputs(&inputs);
+        let e = self.graph.reshape(&e, &[1, self.settings.stoch_width()]);
+        let sum = self.linear_share("environment.input.linear", &e, 0);
+        self.branch("environment", &sum, &h, &features, &noise);
+    }
+
+    /// Declares the inputs.
+    pub fn inputs<const N: usize>(&mut self, specs: &[TensorSpec]) -> [Value; N] {
+        let values: Vec<Value> = specs.iter().map(|spec| self.graph.input(spec)).collect();
+        values.try_into().expect("the part has as many inputs as its signature")
+    }
+
+    /// `a / max(1, |a|)`.
+    fn normalised_action(&mut self, action: &Value) -> Value {
+        let size = self.graph.unary("Abs", action);
+        let one = self.graph.scalar(1.0);
+        let divisor = self.graph.binary("Max", &size, &one);
+        self.graph.binary("Div", action, &divisor)
+    }
+
+    /// What both branches do after their input layer's product.
+    fn branch(&mut self, name: &str, input: &Value, h: &Value, features: &Value, noise: &Value) {
+        let d = self.settings.deter;
+        let x = self.norm_silu(&format!("{name}.input.norm"), input);
+        let h_next = self.cell(name, &x, h);
+        let noise = self.graph.split(noise, 0, &[1, 1]);
+
+        let hidden = self.dense(&format!("{name}.prior.dense"), &h_next);
+        let prior = self.log_probs(&format!("{name}.prior.logits"), &hidden);
+        let prior_z = self.draw(&prior, &noise[0]);
+
+        let embed = self.conv_stack(&format!("encoder.{name}"), features.clone()); // [1, 4c, 4, 4]
+        let embed = self.graph.reshape(&embed, &[1, 16 * 4 * self.settings.cnn_depth]);
+        // The share of h' needs no image, and can be ready when it comes.
+        let dense = format!("{name}.posterior.dense");
+        let h_share = self.linear_share(&format!("{dense}.linear"), &h_next, 0);
+        let embed_share = self.linear_share(&format!("{dense}.linear"), &embed, d);
+        let sum = self.graph.add(&h_share, &embed_share);
+        let hidden = self.norm_silu(&format!("{dense}.norm"), &sum);
+        let posterior = self.log_probs(&format!("{name}.posterior.logits"), &hidden);
+        let posterior_z = self.draw(&posterior, &noise[1]);
+
+        self.graph.output("h_next", &h_next);
+        self.graph.output("prior_z", &prior_z);
+        self.graph.output("posterior_z", &posterior_z);
+        self.graph.output("prior_log_probs", &prior);
+        self.graph.output("posterior_log_probs", &posterior);
+    }
+
+    /// The recurrent cell.
+    fn cell(&mut self, name: &str, x: &Value, h: &Value) -> Value {
+        let d = self.settings.deter;
+        let both = self.graph.concat(&[x, h], 1);
+        let product = self.linear_share(&format!("{name}.cell.linear"), &both, 0); // [1, 3d]
+        let gates = self.norm(&format!("{name}.cell.norm"), &product, NORM_EPS);
+        let gates = self.graph.split(&gates, 1, &[d, d, d]);
+        let reset = self.graph.unary("Sigmoid", &gates[0]);
+        let cand = self.graph.mul(&reset, &gates[1]);
+        let cand = self.graph.unary("Tanh", &cand);
+        let update = self.graph.shift(&gates[2], -1.0);
+        let update = self.graph.unary("Sigmoid", &update);
+        let change = self.graph.binary("Sub", &cand, h);
+        let change = self.graph.mul(&update, &change);
+        self.graph.add(h, &change)
+    }
+
+    /// Log-probabilities [1, n, m] with the uniform share mixed in.
+    fn log_probs(&mut self, name: &str, hidden: &Value) -> Value {
+        let (n, m) = (self.settings.categoricals, self.settings.classes);
+        let logits = self.linear(name, hidden);
+        let logits = self.graph.reshape(&logits, &[1, n, m]);
+        let p = self.graph.softmax(&logits);
+        let unimix = self.settings.unimix;
+        let p = self.graph.affine(&p, (1.0 - unimix) as f32, (unimix / m as f64) as f32);
+        self.graph.unary("Log", &p)
+    }
+
+    /// Class indices [1, n].
+    fn draw(&mut self, log_probs: &Value, noise: &Value) -> Value {
+        let scores = self.graph.add(log_probs, noise);
+        self.graph.arg_max(&scores)
+    }
+
+    /// Two convolutions with their normalisations.
+    fn conv_stack(&mut self, name: &str, x: Value) -> Value {
+        (0..2).fold(x, |x, index| {
+            let weight = self.parameter(&format!("{name}.{index}.conv.weight"));
+            let x = self.graph.conv_down(&x, &weight);
+            self.channel_norm_silu(&format!("{name}.{index}.norm"), &x)
+        })
+    }
+}
