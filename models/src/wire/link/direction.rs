@@ -160,19 +160,35 @@ impl<T: ZeroCopySend + std::fmt::Debug + 'static> Receiver<T> {
             if left.is_zero() || self.pending.get().hello {
                 return Ok((Wait::TimedOut, self.pending.take()));
             }
-            self.note_events(|note| self.listener.timed_wait(note, left))?;
+            if self.note_events(|note| self.listener.timed_wait(note, left))? == Woken::BySignal {
+                // The program has a handler and wants to look at what it noted.
+                return Ok((Wait::TimedOut, Events::default()));
+            }
         }
     }
 
     fn note_events(
         &self,
         collect: impl FnOnce(&mut dyn FnMut(EventActivation)) -> Result<u64, ListenerWaitError>,
-    ) -> Result<(), LinkError> {
+    ) -> Result<Woken, LinkError> {
         let mut events = self.pending.get();
-        collect(&mut |event| events.note(event.id)).map_err(traffic("waiting for the peer"))?;
+        let result = collect(&mut |event| events.note(event.id));
         self.pending.set(events);
-        Ok(())
+        match result {
+            Ok(_) => Ok(Woken::InOrder),
+            Err(ListenerWaitError::InterruptSignal) => Ok(Woken::BySignal),
+            Err(error) => Err(traffic("waiting for the peer")(error)),
+        }
     }
+}
+
+/// What ended a wait on the event service.
+#[derive(PartialEq, Eq)]
+enum Woken {
+    /// An event, or the time was up.
+    InOrder,
+    /// A signal to the process (Ctrl-C).
+    BySignal,
 }
 
 impl Events {

@@ -46,7 +46,7 @@ impl LinkSettings {
 pub enum Wait<T> {
     /// A message.
     Message(T),
-    /// The time was up.
+    /// The time was up, or a signal to the process (Ctrl-C) has cut the wait short.
     TimedOut,
     /// The peer said that it closes.
     Closed,
