@@ -20,6 +20,8 @@ CAMERA_POSITION = (0.75, 0.075, 0.7)
 JOINTS = tuple(f"right_j{i}" for i in range(7)) + ("r_close", "l_close")
 # Share of the robot's triangles that the fast picture keeps; at a twentieth the arm has visible holes.
 MESH_SHARE = 0.2
+# The library keeps one mesh for the whole process, and lets other threads run meanwhile.
+SIMPLIFYING = threading.Lock()
 # Numbers that keep apart the random streams of one episode.
 STREAM_LAYOUT, STREAM_LOOK = 0, 1
 
@@ -258,7 +260,8 @@ def simplify_meshes(model, meshes):
         # Points that lie in one place become one, or cracks open between the patches of a surface.
         points, place = np.unique(model.mesh_vert[vertices], axis=0, return_inverse=True)
         corners = place[model.mesh_face[faces]].astype(np.int32)
-        points, corners = fast_simplification.simplify(points, corners, 1 - MESH_SHARE)
+        with SIMPLIFYING:
+            points, corners = fast_simplification.simplify(points, corners, 1 - MESH_SHARE)
         normals = vertex_normals(points, corners)
         write(model.mesh_vert, model.mesh_vertadr, model.mesh_vertnum, mesh, points)
         write(model.mesh_normal, model.mesh_normaladr, model.mesh_normalnum, mesh, normals)

@@ -6,7 +6,7 @@ use rustix::time::{ClockId, Timespec};
 
 const NS_PER_S: u64 = 1_000_000_000;
 
-/// Ticks at `start + k * period`.
+/// Ticks at `first + k * period`.
 #[derive(Debug, Clone)]
 pub struct Schedule {
     period_ns: u64,
@@ -14,14 +14,14 @@ pub struct Schedule {
 }
 
 impl Schedule {
-    /// A schedule whose first tick is one period after `start_ns`.
+    /// A schedule whose first tick is at `first_ns`.
     ///
     /// # Panics
     /// When the period is zero.
     #[must_use]
-    pub fn starting_at(start_ns: u64, period_ns: u64) -> Self {
+    pub fn with_first_tick(first_ns: u64, period_ns: u64) -> Self {
         assert!(period_ns > 0, "the period of a fixed clock is positive");
-        Self { period_ns, next_ns: start_ns + period_ns }
+        Self { period_ns, next_ns: first_ns }
     }
 
     /// When the next tick is due.
@@ -33,11 +33,10 @@ impl Schedule {
     /// Ends the present tick at `now_ns`; returns how many further ticks are lost because they were already due.
     pub fn advance(&mut self, now_ns: u64) -> u64 {
         self.next_ns += self.period_ns;
-        let late_ns = now_ns.saturating_sub(self.next_ns);
-        if now_ns < self.next_ns {
-            return 0;
-        }
-        let missed = late_ns / self.period_ns + 1;
+        let missed = match now_ns.checked_sub(self.next_ns) {
+            Some(late_ns) => late_ns / self.period_ns + 1,
+            None => 0,
+        };
         self.next_ns += missed * self.period_ns;
         missed
     }
@@ -60,7 +59,7 @@ mod tests {
 
     #[test]
     fn ticks_keep_to_the_schedule_when_the_work_is_short() {
-        let mut schedule = Schedule::starting_at(100, 10);
+        let mut schedule = Schedule::with_first_tick(110, 10);
         assert_eq!(schedule.next_ns(), 110);
         assert_eq!(schedule.advance(117), 0);
         assert_eq!(schedule.advance(129), 0);
@@ -69,7 +68,7 @@ mod tests {
 
     #[test]
     fn late_ticks_are_skipped_and_counted_and_the_grid_is_kept() {
-        let mut schedule = Schedule::starting_at(100, 10);
+        let mut schedule = Schedule::with_first_tick(110, 10);
         assert_eq!(schedule.advance(120), 1);
         assert_eq!(schedule.next_ns(), 130);
         assert_eq!(schedule.advance(175), 4);

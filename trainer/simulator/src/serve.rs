@@ -152,7 +152,7 @@ impl Server<'_> {
         let mut script = Script::new(self.settings.policy, self.environment.settings().seed, episode);
         self.place = Place { sequence: self.place.sequence, episode, ..Place::default() };
         let (mut sum, mut solved) = (0.0, false);
-        let mut clock = self.clock();
+        let mut clock = self.clock(1);
         self.publish_new(monotonic_ns(), &mut sum, &mut solved)?;
         loop {
             let Some(answer) = self.answer(&mut clock)? else { return Ok(false) };
@@ -172,9 +172,12 @@ impl Server<'_> {
         Ok(true)
     }
 
-    fn clock(&self) -> Option<Schedule> {
+    /// In real time, a schedule whose first tick is so many periods from now.
+    fn clock(&self, periods: u64) -> Option<Schedule> {
         match self.settings.pace {
-            Pace::RealTime { period_ns } => Some(Schedule::starting_at(monotonic_ns(), period_ns)),
+            Pace::RealTime { period_ns } => {
+                Some(Schedule::with_first_tick(monotonic_ns() + periods * period_ns, period_ns))
+            }
             Pace::LockStep | Pace::Free => None,
         }
     }
@@ -262,7 +265,7 @@ impl Server<'_> {
             (Pace::Free, _) => {
                 let events = self.link.poll_events()?;
                 self.note(events);
-                Ok((!self.stopped()).then(|| None))
+                Ok((!self.stopped()).then_some(None))
             }
             (Pace::RealTime { .. }, Some(clock))
                 if self.met_controller || self.settings.policy.is_scripted() =>
@@ -271,8 +274,8 @@ impl Server<'_> {
             }
             (_, clock) => {
                 let answer = self.wait_for_answer()?;
-                // Waiting for the first controller is no lateness.
-                *clock = self.clock();
+                // Waiting for the first controller is no lateness: the clock starts with its answer.
+                *clock = self.clock(0);
                 Ok(answer)
             }
         }
@@ -306,12 +309,12 @@ impl Server<'_> {
         while !self.stopped() {
             let (wait, events) = self.link.wait_action(WAIT_SLICE)?;
             self.note(events);
-            if let Wait::Message(action) = wait {
-                if self.is_answer(&action) {
-                    self.met_controller = true;
-                    self.tally.answer.add_ns(monotonic_ns().saturating_sub(self.place.published_ns));
-                    return Ok(Some(self.checked(&action)));
-                }
+            if let Wait::Message(action) = wait
+                && self.is_answer(&action)
+            {
+                self.met_controller = true;
+                self.tally.answer.add_ns(monotonic_ns().saturating_sub(self.place.published_ns));
+                return Ok(Some(self.checked(&action)));
             }
             let silent = published.elapsed() >= SILENCE;
             if silent {
