@@ -102,7 +102,8 @@ impl Export {
 
     fn summarise(&self, bundle: &Bundle) -> Result<()> {
         let manifest = &bundle.manifest;
-        let parts = manifest.parts.iter().map(|part| PartSize { name: part.name.as_str(), bytes: part.bytes });
+        let parts =
+            manifest.parts.iter().map(|part| PartSize { name: part.name.as_str(), bytes: part.bytes });
         let outcome = Outcome {
             bundle: &self.out,
             bytes: manifest.parts.iter().map(|part| part.bytes).sum(),
@@ -112,7 +113,12 @@ impl Export {
         for part in &outcome.parts {
             println!("{:<12} {:>8.2} MB", part.name, part.bytes as f64 / 1e6);
         }
-        println!("{:<12} {:>8.2} MB, {}", "golden", outcome.golden_bytes as f64 / 1e6, manifest.provenance.data);
+        println!(
+            "{:<12} {:>8.2} MB, {}",
+            "golden",
+            outcome.golden_bytes as f64 / 1e6,
+            manifest.provenance.data
+        );
         println!("bundle in {}", self.out.display());
         match &self.json {
             Some(path) => super::write_json(path, &outcome),

@@ -1,6 +1,6 @@
 //! The model's building blocks as graphs. Names are those of the parameters.
 
-use ndarray::{Array2, ArrayD, concatenate, Axis};
+use ndarray::{Array2, ArrayD, Axis, concatenate};
 use rcwm_models::settings::ModelSettings;
 
 use super::graph::{Graph, Value};

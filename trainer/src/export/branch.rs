@@ -11,7 +11,7 @@ impl Part<'_> {
     pub fn encoder(&mut self) {
         let (inputs, _) = PartName::Encoder.signature(self.settings);
         let image = self.graph.input(&inputs[0]);
-        let x = self.graph.to_float(&image); // [1, 64, 64, 3]
+        let x = self.graph.cast_to_float(&image); // [1, 64, 64, 3]
         let full = self.graph.scalar(255.0);
         let x = self.graph.binary("Div", &x, &full);
         let x = self.graph.shift(&x, -0.5);

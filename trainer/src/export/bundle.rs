@@ -7,7 +7,8 @@ use std::path::{Path, PathBuf};
 use ndarray::{ArrayD, IxDyn};
 use rcwm_models::ACTION_LEN;
 use rcwm_models::bundle::{
-    Bundle, Control, FORMAT, FileEntry, InitialState, MANIFEST_FILE, Manifest, PartEntry, PartName, Provenance,
+    Bundle, Control, FORMAT, FileEntry, InitialState, MANIFEST_FILE, Manifest, PartEntry, PartName,
+    Provenance,
 };
 use rcwm_models::files::{sha256_hex, write_atomic};
 use rcwm_models::tensors::{Tensors, Values};
@@ -120,12 +121,8 @@ fn provenance(checkpoint: &Checkpoint, options: &Options, scene: &Scene) -> Prov
 
 fn initial_tensors(initial: &InitialState) -> Tensors {
     let row = |len: usize| IxDyn(&[1, len]);
-    let h = |values: &[f32]| {
-        Values::F32(ArrayD::from_shape_fn(row(values.len()), |index| values[index[1]]))
-    };
-    let z = |values: &[i64]| {
-        Values::I64(ArrayD::from_shape_fn(row(values.len()), |index| values[index[1]]))
-    };
+    let h = |values: &[f32]| Values::F32(ArrayD::from_shape_fn(row(values.len()), |index| values[index[1]]));
+    let z = |values: &[i64]| Values::I64(ArrayD::from_shape_fn(row(values.len()), |index| values[index[1]]));
     let named = [
         ("robot/h", h(&initial.robot_h)),
         ("robot/z", z(&initial.robot_z)),
@@ -157,7 +154,8 @@ fn check_place(place: &Path, replace: bool) -> Result<bool, ExportError> {
 fn put_in_place(building: tempfile::TempDir, place: &Path, replaces: bool) -> Result<(), ExportError> {
     let flags = if replaces { RenameFlags::EXCHANGE } else { RenameFlags::NOREPLACE };
     make_readable(building.path()).map_err(folder_error(place))?;
-    renameat_with(CWD, building.path(), CWD, place, flags).map_err(|errno| folder_error(place)(errno.into()))?;
+    renameat_with(CWD, building.path(), CWD, place, flags)
+        .map_err(|errno| folder_error(place)(errno.into()))?;
     let parent = parent_of(place);
     File::open(parent).and_then(|folder| folder.sync_all()).map_err(folder_error(parent))?;
     if replaces {

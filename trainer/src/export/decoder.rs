@@ -33,7 +33,9 @@ impl Part<'_> {
         let channels = 8 * self.settings.cnn_depth;
         let weight = channels_first(&self.weights.matrix(&format!("{name}.linear.weight")), channels);
         let bias = self.weights.get(&format!("{name}.linear.bias")).clone();
-        let bias = bias.into_shape_with_order((1, 16 * channels)).expect("a bias for each of the 4x4 pixels' channels");
+        let bias = bias
+            .into_shape_with_order((1, 16 * channels))
+            .expect("a bias for each of the 4x4 pixels' channels");
         let bias = channels_first(&bias, channels);
 
         let z_rows = weight.slice(ndarray::s![..nm, ..]).to_owned();

@@ -76,7 +76,13 @@ struct Recorder<'a> {
 
 impl Recorder<'_> {
     /// One tick; gives the posterior state.
-    fn tick(&mut self, world: &Rcwm, before: &State, scene: &Scene, tick: usize) -> Result<State, ExportError> {
+    fn tick(
+        &mut self,
+        world: &Rcwm,
+        before: &State,
+        scene: &Scene,
+        tick: usize,
+    ) -> Result<State, ExportError> {
         let image = scene.image(tick)?; // [1, 64, 64, 3]
         let features = world.features(&image)?; // [1, 16, 16, 2c]
         if tick < LARGE_TICKS {
@@ -93,7 +99,8 @@ impl Recorder<'_> {
         let environment_h = world.recur_environment(&e, &environment.h)?;
         let environment = self.branch(PartName::Environment, world, ENVIRONMENT, environment_h, &features)?;
         // One-hot rows exactly, as the runtime carries class indices.
-        let state = State { branches: vec![robot.posterior, environment.posterior] }.map(|x| Ok(x.detach()))?;
+        let state =
+            State { branches: vec![robot.posterior, environment.posterior] }.map(|x| Ok(x.detach()))?;
         self.heads(&state)?;
         if tick < LARGE_TICKS {
             self.pictures(&state)?;

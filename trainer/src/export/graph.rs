@@ -38,7 +38,8 @@ pub struct Graph {
 impl Graph {
     /// An empty graph.
     pub fn new(name: &str, doc: &str) -> Self {
-        let graph = onnx::Graph { name: name.to_owned(), doc_string: doc.to_owned(), ..onnx::Graph::default() };
+        let graph =
+            onnx::Graph { name: name.to_owned(), doc_string: doc.to_owned(), ..onnx::Graph::default() };
         Self { graph, outputs: Vec::new() }
     }
 
@@ -72,7 +73,9 @@ impl Graph {
     fn constant(&mut self, tensor: onnx::Tensor, dtype: DType, shape: &[usize]) -> Value {
         let value = Value { name: tensor.name.clone(), dtype, shape: shape.to_vec() };
         match self.graph.initializer.iter().find(|known| known.name == tensor.name) {
-            Some(known) => assert_eq!(known.raw_data, tensor.raw_data, "two constants are called {}", tensor.name),
+            Some(known) => {
+                assert_eq!(known.raw_data, tensor.raw_data, "two constants are called {}", tensor.name)
+            }
             None => self.graph.initializer.push(tensor),
         }
         value
@@ -153,7 +156,12 @@ pub fn int(name: &str, value: i64) -> Attribute {
 
 /// A list of integers.
 pub fn ints(name: &str, values: &[i64]) -> Attribute {
-    Attribute { name: name.to_owned(), ints: values.to_vec(), r#type: attribute_type::INTS, ..Attribute::default() }
+    Attribute {
+        name: name.to_owned(),
+        ints: values.to_vec(),
+        r#type: attribute_type::INTS,
+        ..Attribute::default()
+    }
 }
 
 /// A float attribute.

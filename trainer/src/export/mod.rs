@@ -118,7 +118,9 @@ fn describe(name: PartName) -> &'static str {
         PartName::Encoder => "Shared encoder: image to features",
         PartName::Robot => "Robot branch with its encoder: one step of the recurrence, prior and posterior",
         PartName::Interaction => "Cross-attention from the environment's state to the robot's prior",
-        PartName::Environment => "Environment branch with its encoder: one step of the recurrence, prior and posterior",
+        PartName::Environment => {
+            "Environment branch with its encoder: one step of the recurrence, prior and posterior"
+        }
         PartName::Actor => "Action distribution of a state",
         PartName::Reward => "Expected reward of a state",
         PartName::Continue => "Probability that the episode goes on",

@@ -127,7 +127,7 @@ impl Graph {
     }
 
     /// u8 to f32.
-    pub fn to_float(&mut self, x: &Value) -> Value {
+    pub fn cast_to_float(&mut self, x: &Value) -> Value {
         let to = int("to", DType::F32.to_onnx().into());
         self.node("Cast", &[x], vec![to], DType::F32, x.shape())
     }
@@ -155,6 +155,7 @@ fn with_axis(shape: &[usize], axis: usize, size: usize) -> Vec<usize> {
 /// The shape of an elementwise operation.
 fn broadcast(a: &[usize], b: &[usize]) -> Vec<usize> {
     let rank = a.len().max(b.len());
-    let dim = |shape: &[usize], axis: usize| (axis + shape.len()).checked_sub(rank).map_or(1, |axis| shape[axis]);
+    let dim =
+        |shape: &[usize], axis: usize| (axis + shape.len()).checked_sub(rank).map_or(1, |axis| shape[axis]);
     (0..rank).map(|axis| dim(a, axis).max(dim(b, axis))).collect()
 }

@@ -61,7 +61,9 @@ impl Scene {
     }
 
     fn with_resting_beginnings(mut self) -> Self {
-        for (mut action, _) in self.actions.rows_mut().into_iter().zip(&self.first).filter(|(_, first)| **first) {
+        for (mut action, _) in
+            self.actions.rows_mut().into_iter().zip(&self.first).filter(|(_, first)| **first)
+        {
             action.fill(0.0);
         }
         self
