@@ -104,13 +104,25 @@ pub fn main() -> ExitCode {
     match result {
         Ok(()) => ExitCode::SUCCESS,
         Err(error) => {
-            eprintln!("error: {}", format!("{error:#}").replace('\n', " "));
+            eprintln!("error: {}", one_line(&error));
             match error.downcast_ref::<ControllerError>() {
                 Some(ControllerError::NoObservation { .. }) => ExitCode::from(EXIT_NO_OBSERVATION),
                 _ => ExitCode::FAILURE,
             }
         }
     }
+}
+
+/// The error and its causes, without those that the error's own text already tells.
+fn one_line(error: &anyhow::Error) -> String {
+    let mut text = String::new();
+    for cause in error.chain().map(|cause| cause.to_string().replace('\n', " ")) {
+        if !text.contains(&cause) {
+            text += if text.is_empty() { "" } else { ": " };
+            text += &cause;
+        }
+    }
+    text
 }
 
 fn open_bundle(folder: &Path) -> anyhow::Result<Bundle> {
@@ -121,7 +133,7 @@ fn open_bundle(folder: &Path) -> anyhow::Result<Bundle> {
             folder.display()
         );
     }
-    Bundle::open(folder).with_context(|| format!("{}", folder.display()))
+    Bundle::open(folder).with_context(|| format!("{} is not a usable bundle", folder.display()))
 }
 
 fn write_json(path: Option<&PathBuf>, report: &impl Serialize) -> anyhow::Result<()> {

@@ -6,6 +6,7 @@
 #[cfg(feature = "ort")]
 mod onnxruntime;
 mod tract;
+mod weights;
 
 use rcwm_models::bundle::{Bundle, DType, PartName, TensorSpec};
 use serde::Serialize;
@@ -95,6 +96,19 @@ pub enum EngineError {
     NoPart {
         /// The part.
         part: PartName,
+    },
+    /// A weight that no training gives.
+    #[error(
+        "{part}: weight {tensor:?} holds {found}, accepted are finite values up to 1e6; the bundle is damaged or its \
+         training has diverged: export another checkpoint"
+    )]
+    Weights {
+        /// The part.
+        part: PartName,
+        /// The constant.
+        tensor: String,
+        /// The value.
+        found: String,
     },
     /// A part could not be made ready.
     #[error("engine {engine}: loading {part}: {reason}")]
@@ -192,9 +206,10 @@ struct Source<'a> {
 /// Loads a part of a bundle.
 ///
 /// # Errors
-/// [`EngineError::NoPart`], [`EngineError::Load`], or what is wrong with ONNX Runtime's library.
+/// [`EngineError::NoPart`], [`EngineError::Weights`], [`EngineError::Load`], or what is wrong with ONNX Runtime's library.
 pub fn load(bundle: &Bundle, part: PartName, settings: EngineSettings) -> Result<Box<dyn Part>, EngineError> {
     let bytes = bundle.part(part).ok_or(EngineError::NoPart { part })?;
+    weights::check(part, bytes)?;
     let (inputs, outputs) = part.signature(&bundle.manifest.model);
     let source = Source { part, bytes, inputs, outputs };
     match settings.kind {

@@ -110,7 +110,8 @@ mod tests {
     #[test]
     fn samples_repeat_with_their_seed_and_have_the_right_moments() {
         let (mut a, mut b) = (source(Sampling::Sample { seed: 7 }), source(Sampling::Sample { seed: 7 }));
-        (a.draw(), b.draw());
+        a.draw();
+        b.draw();
         assert_eq!(a.robot(), b.robot());
         assert_eq!(a.action(&[0.0; 4], &[1.0; 4]), b.action(&[0.0; 4], &[1.0; 4]));
         let mut rng = ChaCha8Rng::seed_from_u64(1);

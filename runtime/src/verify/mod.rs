@@ -171,8 +171,7 @@ fn failures(parts: &[PartReport], recurrent: &RecurrentReport, tolerance: f32) -
     let mut failures = Vec::new();
     for part in parts {
         for output in part.outputs.iter().filter(|output| !output.classes) {
-            // Written so that NaN fails.
-            if !(output.error_max <= tolerance) {
+            if exceeds(output.error_max, tolerance) {
                 let OutputError { output, error_max, .. } = output;
                 failures.push(format!(
                     "{}: {output} is {error_max:.2e} off, accepted is {tolerance:.0e}",
@@ -184,13 +183,18 @@ fn failures(parts: &[PartReport], recurrent: &RecurrentReport, tolerance: f32) -
     }
     failures.extend(clear_flips("recurrent run", &recurrent.flips));
     for (what, error) in [("mean", recurrent.mean_error_max), ("std", recurrent.std_error_max)] {
-        if !(error <= ACTION_TOLERANCE) {
+        if exceeds(error, ACTION_TOLERANCE) {
             failures.push(format!(
                 "recurrent run: the action's {what} is {error:.2e} off, accepted is {ACTION_TOLERANCE:.0e}"
             ));
         }
     }
     failures
+}
+
+/// NaN exceeds everything.
+fn exceeds(error: f32, tolerance: f32) -> bool {
+    error.is_nan() || error > tolerance
 }
 
 fn clear_flips(where_: &str, flips: &[Flip]) -> Option<String> {

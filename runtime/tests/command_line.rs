@@ -1,0 +1,120 @@
+//! The binary: verbs, exit codes, and errors that say what to do.
+
+#![allow(clippy::unwrap_used, reason = "a test that fails panics")]
+
+mod support;
+
+use assert_cmd::Command;
+use rcwm_models::files::sha256_hex;
+use rcwm_models::tensors::{Tensors, Values};
+use support::{own_link, smallest_bundle, with_manifest};
+
+fn runtime() -> Command {
+    Command::cargo_bin("rcwm-runtime").unwrap()
+}
+
+/// The one line on stderr of a command that fails with `code`.
+fn error_of(command: &mut Command, code: i32) -> String {
+    let output = command.assert().code(code).get_output().clone();
+    let text = String::from_utf8(output.stderr).unwrap();
+    let lines: Vec<_> = text.lines().filter(|line| line.starts_with("error: ")).collect();
+    assert_eq!(lines.len(), 1, "{text}");
+    lines[0].to_owned()
+}
+
+#[test]
+fn a_bundle_that_is_not_there_is_one_line_that_says_how_to_make_one() {
+    for verb in ["verify", "inspect", "bench"] {
+        let error = error_of(runtime().args([verb, "--bundle", "no/such/bundle"]), 1);
+        assert!(error.contains("no/such/bundle") && error.contains("rcwm-trainer export"), "{error}");
+    }
+}
+
+#[test]
+fn a_bundle_with_a_flipped_bit_is_refused_by_name() {
+    let bundle = with_manifest(|_| {});
+    let path = bundle.path().join("actor.onnx");
+    let mut bytes = std::fs::read(&path).unwrap();
+    let middle = bytes.len() / 2;
+    bytes[middle] ^= 1;
+    std::fs::write(&path, bytes).unwrap();
+    let error = error_of(runtime().args(["verify", "--bundle"]).arg(bundle.path()), 1);
+    assert!(error.contains("actor.onnx") && error.contains("sha256"), "{error}");
+}
+
+#[test]
+fn the_shipped_bundle_verifies_and_one_with_another_start_does_not() {
+    let json = tempfile::NamedTempFile::new().unwrap();
+    let mut verify = runtime();
+    verify.args(["verify", "--bundle"]).arg(smallest_bundle()).arg("--json").arg(json.path());
+    verify.assert().success();
+    let report: serde_json::Value = serde_json::from_slice(&std::fs::read(json.path()).unwrap()).unwrap();
+    assert_eq!(report["verified"], true);
+    let error = error_of(runtime().args(["verify", "--bundle"]).arg(with_other_start().path()), 1);
+    assert!(error.contains("NOT verified"), "{error}");
+}
+
+/// A bundle whose initial state is not the one its golden values start from.
+fn with_other_start() -> tempfile::TempDir {
+    let path = smallest_bundle().join("initial.safetensors");
+    let mut tensors = Tensors::from_bytes(&std::fs::read(path).unwrap()).unwrap();
+    let Some(Values::F32(h)) = tensors.0.get_mut("robot/h") else { panic!("robot/h is f32") };
+    h.map_inplace(|value| *value += 0.01);
+    let bytes = tensors.to_bytes().unwrap();
+    let bundle = with_manifest(|manifest| {
+        (manifest.initial.bytes, manifest.initial.sha256) = (bytes.len() as u64, sha256_hex(&bytes));
+    });
+    std::fs::write(bundle.path().join("initial.safetensors"), bytes).unwrap();
+    bundle
+}
+
+#[test]
+fn onnx_runtime_that_is_not_there_is_an_error_when_asked_for_by_name() {
+    for (path, said) in [(None, "is not set"), (Some("/no/such/libonnxruntime.so"), "no such file")] {
+        let mut command = runtime();
+        command
+            .env_remove("ORT_DYLIB_PATH")
+            .args(["verify", "--engine", "ort", "--bundle"])
+            .arg(smallest_bundle());
+        if let Some(path) = path {
+            command.env("ORT_DYLIB_PATH", path);
+        }
+        let error = error_of(&mut command, 1);
+        assert!(error.contains("ORT_DYLIB_PATH") && error.contains(said), "{error}");
+    }
+}
+
+#[test]
+fn a_library_that_is_not_onnx_runtime_is_an_error_not_a_hang() {
+    let not_a_library = tempfile::NamedTempFile::new().unwrap();
+    std::fs::write(not_a_library.path(), b"not a library").unwrap();
+    let mut command = runtime();
+    command.env("ORT_DYLIB_PATH", not_a_library.path());
+    command.args(["verify", "--engine", "ort", "--bundle"]).arg(smallest_bundle());
+    let error = error_of(&mut command, 1);
+    assert!(error.contains("ORT_DYLIB_PATH"), "{error}");
+}
+
+#[test]
+fn a_run_that_nobody_talks_to_ends_with_its_own_exit_code() {
+    let link = own_link();
+    let mut command = runtime();
+    command.env("RCWM_PREFIX", link.prefix.unwrap());
+    command.args(["run", "--instance", "silent", "--timeout", "0.3", "--bundle"]).arg(smallest_bundle());
+    let error = error_of(&mut command, 3);
+    assert!(error.contains("rcwm-simulator serve --instance silent"), "{error}");
+}
+
+#[test]
+fn inspect_counts_every_part_once() {
+    let json = tempfile::NamedTempFile::new().unwrap();
+    let mut inspect = runtime();
+    inspect.args(["inspect", "--bundle"]).arg(smallest_bundle()).arg("--json").arg(json.path());
+    inspect.assert().success();
+    let info: serde_json::Value = serde_json::from_slice(&std::fs::read(json.path()).unwrap()).unwrap();
+    let parts = info["parts"].as_array().unwrap();
+    let in_tick = parts.iter().filter(|part| part["in_tick"] == true);
+    let sum: u64 = in_tick.map(|part| part["parameters"].as_u64().unwrap()).sum();
+    assert_eq!(info["tick"]["parameters"].as_u64().unwrap(), sum);
+    assert!(sum > 0 && info["tick"]["flops"].as_u64().unwrap() > 0);
+}
