@@ -86,11 +86,11 @@ pub struct Tally {
     pub controllers_came: u64,
     /// Controllers that have said that they leave; one that was killed does not.
     pub controllers_left: u64,
-    /// From publishing an observation to its answer.
+    /// From publishing an observation to its answer, the very first one excepted.
     pub answer: Durations,
     /// Physics and pictures of one step.
     pub work: Durations,
-    /// Time of the serving loop.
+    /// Time of the serving loop since the first answer.
     pub seconds: f64,
 }
 

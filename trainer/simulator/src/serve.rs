@@ -104,12 +104,12 @@ pub fn serve(
         tally: Tally::default(),
         place: Place::default(),
         met_controller: false,
+        started: Instant::now(),
         progress: &progress,
     };
-    let start = Instant::now();
     let served = server.episodes();
     let mut tally = server.tally;
-    tally.seconds = start.elapsed().as_secs_f64();
+    tally.seconds = server.started.elapsed().as_secs_f64();
     let closed = link.close();
     served?;
     closed?;
@@ -125,6 +125,8 @@ struct Server<'a> {
     place: Place,
     /// Whether any answer has come; the fixed clock does not start before.
     met_controller: bool,
+    /// When the first answer came, or the loop began where none is waited for.
+    started: Instant,
     progress: &'a dyn Fn(u64, u32),
 }
 
@@ -294,7 +296,7 @@ impl Server<'_> {
         self.note(events);
         let answer = match self.link.poll_action()? {
             Some(action) if self.is_answer(&action) => {
-                self.tally.answer.add_ns(action.published_ns.saturating_sub(self.place.published_ns));
+                self.meet_controller(action.published_ns);
                 self.checked(&action)
             }
             _ => None,
@@ -312,8 +314,7 @@ impl Server<'_> {
             if let Wait::Message(action) = wait
                 && self.is_answer(&action)
             {
-                self.met_controller = true;
-                self.tally.answer.add_ns(monotonic_ns().saturating_sub(self.place.published_ns));
+                self.meet_controller(monotonic_ns());
                 return Ok(Some(self.checked(&action)));
             }
             let silent = published.elapsed() >= SILENCE;
@@ -328,6 +329,16 @@ impl Server<'_> {
             }
         }
         Ok(None)
+    }
+
+    /// Notes the time of an answer, but for the first one: the simulator was there before its controller.
+    fn meet_controller(&mut self, answered_ns: u64) {
+        if self.met_controller {
+            self.tally.answer.add_ns(answered_ns.saturating_sub(self.place.published_ns));
+        } else {
+            self.met_controller = true;
+            self.started = Instant::now();
+        }
     }
 
     fn check_silence(&self, start: Instant) -> Result<(), SimulatorError> {

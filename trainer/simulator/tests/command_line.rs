@@ -1,6 +1,10 @@
 //! The program as people run it.
+#![allow(clippy::unwrap_used, reason = "a test may panic")]
 
-use std::process::{Command, Output};
+use std::io::{BufRead, BufReader};
+use std::process::{Command, Output, Stdio};
+
+use rustix::process::{Pid, Signal, kill_process};
 
 fn simulator() -> Command {
     let mut command = Command::new(env!("CARGO_BIN_EXE_rcwm-simulator"));
@@ -72,4 +76,23 @@ fn a_free_run_writes_pictures_and_a_summary_for_machines() {
     assert_eq!((report["episodes"].as_u64(), report["steps"].as_u64()), (Some(2), Some(6)));
     let picture = image::open(folder.path().join("reach-e0000-s000.png")).unwrap();
     assert_eq!((picture.width(), picture.height()), (130 * 6, 64 * 6));
+}
+
+#[test]
+fn ctrl_c_ends_a_run_without_an_end_with_its_summary() {
+    let mut running = simulator()
+        .args(["serve", "--task", "reach", "--instance", "endless", "--policy", "random", "--free-run"])
+        .args(["--json", "-"])
+        .stdout(Stdio::piped())
+        .stderr(Stdio::piped())
+        .spawn()
+        .unwrap();
+    let mut line = String::new();
+    BufReader::new(running.stderr.take().unwrap()).read_line(&mut line).unwrap();
+    assert!(line.contains("Ctrl-C ends"), "{line}");
+    kill_process(Pid::from_child(&running), Signal::INT).unwrap();
+    let output = running.wait_with_output().unwrap();
+    assert!(output.status.success());
+    let text = String::from_utf8(output.stdout).unwrap();
+    assert!(text.contains("episodes") && text.contains("\"steps_per_s\""), "{text}");
 }

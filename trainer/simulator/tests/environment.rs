@@ -1,4 +1,5 @@
 //! Meta-World itself: layouts, pictures, masks, disturbances.
+#![allow(clippy::unwrap_used, reason = "a test may panic")]
 
 use rcwm_models::tasks::TASKS;
 use rcwm_models::wire::Observation;

@@ -1,4 +1,5 @@
 //! The serving loop with a controller in another thread, over real shared memory.
+#![allow(clippy::unwrap_used, reason = "a test may panic")]
 
 use std::sync::atomic::{AtomicBool, Ordering};
 use std::thread::JoinHandle;
