@@ -16,10 +16,15 @@ const FILM_SCALE: usize = 3;
 const STRIP_SCALE: usize = 2;
 /// Frames of a strip.
 const STRIP_FRAMES: usize = 10;
-/// GIF players slow down anything faster than this.
-const FRAME_CS_MIN: f64 = 4.0;
-/// Colour quantiser: 1 is slowest and best, 30 fastest.
-const QUANTISER_SPEED: i32 = 10;
+/// Shortest time between two frames: enough to follow an arm, at a third of the size of every tick.
+const FRAME_CS_MIN: f64 = 7.5;
+/// Colours of a film, one less than a palette holds: the last stands for "as before".
+const COLOURS: usize = 255;
+const AS_BEFORE: u8 = COLOURS as u8;
+/// Frames from which the colours are chosen.
+const PALETTE_FRAMES: usize = 6;
+/// One pixel in this many trains the palette: 1 is slowest and best, 30 fastest.
+const PALETTE_SAMPLING: i32 = 10;
 
 /// Writes frames of `rate_hz` as a film that plays at about real speed, leaving out frames where the rate is too high.
 pub(super) fn write_film(path: &Path, frames: &[Canvas], rate_hz: f64) -> Result<(), RecordError> {
@@ -34,22 +39,72 @@ pub(super) fn write_film(path: &Path, frames: &[Canvas], rate_hz: f64) -> Result
         |error: gif::EncodingError| RecordError::Film { path: path.to_path_buf(), reason: error.to_string() };
     let file = File::create(path)
         .map_err(|error| RecordError::Film { path: path.to_path_buf(), reason: error.to_string() })?;
-    let mut encoder = gif::Encoder::new(BufWriter::new(file), width, height, &[]).map_err(failed)?;
+    let shown: Vec<&Canvas> = frames.iter().step_by(every).collect();
+    let mut colours = Colours::of(&shown);
+    let mut encoder =
+        gif::Encoder::new(BufWriter::new(file), width, height, &colours.palette).map_err(failed)?;
     encoder.set_repeat(gif::Repeat::Infinite).map_err(failed)?;
-    for frame in frames.iter().step_by(every) {
-        encoder.write_frame(&film_frame(frame, width, height, delay)).map_err(failed)?;
+    for frame in shown {
+        let buffer = enlarge(&colours.changes(frame), frame.width, FILM_SCALE).into();
+        let frame = gif::Frame {
+            width,
+            height,
+            delay,
+            transparent: Some(AS_BEFORE),
+            buffer,
+            ..gif::Frame::default()
+        };
+        encoder.write_frame(&frame).map_err(failed)?;
     }
     Ok(())
 }
 
-/// Colours are chosen on the small picture: a ninth of the work for the same result.
-fn film_frame(frame: &Canvas, width: u16, height: u16, delay: u16) -> gif::Frame<'static> {
-    let small = |pixels: usize| u16::try_from(pixels).expect("a side that fits when enlarged fits as it is");
-    let mut quantised =
-        gif::Frame::from_rgb_speed(small(frame.width), small(frame.height), &frame.rgb, QUANTISER_SPEED);
-    quantised.buffer = enlarge(&quantised.buffer, frame.width, FILM_SCALE).into();
-    (quantised.width, quantised.height, quantised.delay) = (width, height, delay);
-    quantised
+/// One palette for the whole film, and what was shown last: most of a scene stands still, and what does not change costs
+/// almost nothing.
+struct Colours {
+    quantiser: color_quant::NeuQuant,
+    /// RGB, 256 colours.
+    palette: Vec<u8>,
+    last: Vec<([u8; 3], u8)>,
+}
+
+impl Colours {
+    fn of(frames: &[&Canvas]) -> Self {
+        let every = frames.len().div_ceil(PALETTE_FRAMES).max(1);
+        let sample: Vec<u8> = frames
+            .iter()
+            .step_by(every)
+            .flat_map(|frame| frame.rgb.as_chunks::<3>().0)
+            .flat_map(|[r, g, b]| [*r, *g, *b, u8::MAX])
+            .collect();
+        let quantiser = color_quant::NeuQuant::new(PALETTE_SAMPLING, COLOURS, &sample);
+        let mut palette = quantiser.color_map_rgb();
+        palette.resize(3 * (COLOURS + 1), 0);
+        Self { quantiser, palette, last: Vec::new() }
+    }
+
+    /// Colour numbers of a frame, [`AS_BEFORE`] where the last frame had the same.
+    fn changes(&mut self, frame: &Canvas) -> Vec<u8> {
+        let pixels = frame.rgb.as_chunks::<3>().0;
+        if self.last.len() != pixels.len() {
+            self.last = pixels.iter().map(|pixel| (*pixel, number(&self.quantiser, *pixel))).collect();
+            return self.last.iter().map(|(_, number)| *number).collect();
+        }
+        let Self { quantiser, last, .. } = self;
+        let change = |(pixel, last): (&[u8; 3], &mut ([u8; 3], u8))| {
+            if *pixel == last.0 {
+                return AS_BEFORE;
+            }
+            let before = last.1;
+            *last = (*pixel, number(quantiser, *pixel));
+            if last.1 == before { AS_BEFORE } else { last.1 }
+        };
+        pixels.iter().zip(last).map(change).collect()
+    }
+}
+
+fn number(quantiser: &color_quant::NeuQuant, [r, g, b]: [u8; 3]) -> u8 {
+    u8::try_from(quantiser.index_of(&[r, g, b, u8::MAX])).unwrap_or(0)
 }
 
 /// Which of `count` frames a strip shows: evenly spread, first and last included.
@@ -104,6 +159,19 @@ mod tests {
     }
 
     #[test]
+    fn what_stands_still_is_left_out_of_the_next_frame() {
+        let (red, blue) = ([200, 0, 0], [0, 0, 200]);
+        let first = Canvas::new(8, 8, red);
+        let mut second = first.clone();
+        second.fill(2, 3, 1, 1, blue);
+        let mut colours = Colours::of(&[&first, &second]);
+        assert!(colours.changes(&first).iter().all(|number| *number != AS_BEFORE));
+        let changes = colours.changes(&second);
+        assert_eq!(changes.iter().filter(|number| **number != AS_BEFORE).count(), 1);
+        assert_ne!(changes[3 * 8 + 2], AS_BEFORE);
+    }
+
+    #[test]
     fn a_film_has_the_size_and_the_frames_it_should() {
         let folder = tempfile::tempdir().unwrap();
         let path = folder.path().join("film.gif");
@@ -113,10 +181,10 @@ mod tests {
         assert_eq!((decoder.width(), decoder.height()), (60, 30));
         let mut shown = 0;
         while let Some(frame) = decoder.read_next_frame().unwrap() {
-            // 40 Hz: every second frame, 5 hundredths of a second each.
-            assert_eq!(frame.delay, 5);
+            // 40 Hz: every third frame; 7.5 hundredths of a second, rounded.
+            assert_eq!(frame.delay, 8);
             shown += 1;
         }
-        assert_eq!(shown, 4);
+        assert_eq!(shown, 3);
     }
 }
