@@ -104,6 +104,22 @@ impl Part<'_> {
 
     /// Two dense blocks and an output layer on the whole state.
     pub fn head(&mut self, name: &str, state: &StateInputs) -> Value {
+        let hidden = self.head_hidden(name, state);
+        self.linear(&format!("{name}.out"), &hidden)
+    }
+
+    /// A linear layer with its outputs in another order.
+    pub fn reordered_linear(&mut self, name: &str, x: &Value, order: &[usize]) -> Value {
+        let weight = self.weights.matrix(&format!("{name}.weight")).select(Axis(1), order);
+        let weight = self.matrix(&format!("{name}.weight"), weight);
+        let product = self.graph.matmul(x, &weight);
+        let bias = self.weights.get(&format!("{name}.bias")).select(Axis(0), order);
+        let bias = self.array(&format!("{name}.bias"), &bias);
+        self.graph.add(&product, &bias)
+    }
+
+    /// Two dense blocks on the whole state.
+    pub fn head_hidden(&mut self, name: &str, state: &StateInputs) -> Value {
         let (nm, s) = (self.settings.stoch_width(), self.settings.branch_width());
         let weight = format!("{name}.0.linear.weight");
         let d = self.settings.deter;
@@ -121,7 +137,6 @@ impl Part<'_> {
         let h_share = self.graph.matmul(&h, &h_rows);
         let sum = self.graph.add(&z_share, &h_share);
         let x = self.norm_silu(&format!("{name}.0.norm"), &sum);
-        let x = self.dense(&format!("{name}.1"), &x);
-        self.linear(&format!("{name}.out"), &x)
+        self.dense(&format!("{name}.1"), &x)
     }
 }

@@ -3,7 +3,7 @@
 use rcwm_models::bundle::PartName;
 
 use super::blocks::Part;
-use crate::ops::TWO_HOT_LIMIT;
+use crate::ops::bins;
 
 impl Part<'_> {
     /// State -> mean and standard deviation of the action.
@@ -25,14 +25,17 @@ impl Part<'_> {
     pub fn reward(&mut self) {
         let (inputs, _) = PartName::Reward.signature(self.settings);
         let state = self.state_inputs(&inputs);
-        let logits = self.head("heads.reward", &state); // [1, bins]
+        let hidden = self.head_hidden("heads.reward", &state);
+        // Bins in the order 0, then upwards, then downwards: b and -b then lie side by side (see `ops::two_hot_mean`).
+        let (count, half) = (self.settings.bins, self.settings.bins / 2);
+        let order: Vec<usize> = (half..count).chain((0..half).rev()).collect();
+        let logits = self.reordered_linear("heads.reward.out", &hidden, &order); // [1, bins]
         let p = self.graph.softmax(&logits);
-        let count = self.settings.bins;
-        let middle = (count / 2) as f64;
-        let bins: Vec<f32> =
-            (0..count).map(|index| ((index as f64 - middle) / middle * TWO_HOT_LIMIT) as f32).collect();
-        let bins = self.graph.floats("bins", &[count, 1], &bins);
-        let mean = self.graph.matmul(&p, &bins); // [1, 1], in symlog space
+        let pieces = self.graph.split(&p, 1, &[1, half, half]);
+        let difference = self.graph.binary("Sub", &pieces[1], &pieces[2]);
+        let positive: Vec<f32> = bins(count).skip(half + 1).collect();
+        let positive = self.graph.floats("positive_bins", &[half, 1], &positive);
+        let mean = self.graph.matmul(&difference, &positive); // [1, 1], in symlog space
         let sign = self.graph.unary("Sign", &mean);
         let size = self.graph.unary("Abs", &mean);
         let size = self.graph.unary("Exp", &size);

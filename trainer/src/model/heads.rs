@@ -14,7 +14,8 @@ use crate::ops;
 #[derive(Debug, Clone)]
 pub struct TwoHotHead {
     mlp: Mlp,
-    bins: Tensor,
+    /// The bins above 0, in symlog space.
+    positive_bins: Tensor,
 }
 
 impl TwoHotHead {
@@ -24,7 +25,8 @@ impl TwoHotHead {
     /// Those of [`Scope::get`].
     pub fn new(scope: &Scope<'_>, settings: &ModelSettings) -> Built<Self> {
         let mlp = Mlp::new(scope, settings.state_width(), settings.units, settings.bins, 0.0)?;
-        Ok(Self { mlp, bins: ops::bins(settings.bins, &scope.device())? })
+        let positive = ops::bins(settings.bins).skip(settings.bins / 2 + 1);
+        Ok(Self { mlp, positive_bins: Tensor::from_iter(positive, &scope.device())? })
     }
 
     /// Logits [..., bins] of `features` [..., state width].
@@ -40,7 +42,7 @@ impl TwoHotHead {
     /// # Errors
     /// Those of candle.
     pub fn mean(&self, logits: &Tensor) -> Result<Tensor> {
-        ops::two_hot_mean(logits, &self.bins)
+        ops::two_hot_mean(logits, &self.positive_bins)
     }
 }
 

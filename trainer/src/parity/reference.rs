@@ -5,6 +5,7 @@ use candle_core::{Device, Tensor};
 use rcwm_models::files::{FileError, read_capped};
 use rcwm_models::settings::{ModelKind, ModelSettings, SettingsError};
 use rcwm_models::tensors::{Tensors, TensorsError, Values};
+use rcwm_models::{IMAGE_CHANNELS, IMAGE_SIDE};
 use safetensors::SafeTensors;
 
 /// Largest reference file accepted, in bytes.
@@ -19,7 +20,7 @@ pub enum ReferenceError {
     /// A tensor is missing or of another type, or the file is no safetensors file.
     #[error("reference file: {0}")]
     Tensors(#[from] TensorsError),
-    /// The sizes in its metadata are missing, no numbers, or contradict the tensors.
+    /// A size in its metadata is missing, no number or too small.
     #[error("reference file: metadata {key}: found {found}, expected {expected}")]
     Metadata {
         /// The key.
@@ -92,11 +93,16 @@ impl Reference {
         };
         settings.validate()?;
         let (batch, length, horizon) = (size("batch")?, size("length")?, size("horizon")?);
-        for (key, axis, size) in [("batch", 0, batch), ("length", 1, length)] {
-            let found = width("input/image", axis)?;
-            if found != size {
-                let (found, expected) = (size.to_string(), format!("{found}, the size of input/image"));
-                return Err(ReferenceError::Metadata { key, found, expected });
+        let action = settings.action;
+        for (name, shape) in [
+            ("input/image", vec![batch, length, IMAGE_SIDE, IMAGE_SIDE, IMAGE_CHANNELS]),
+            ("input/action", vec![batch, length, action]),
+            ("input/is_first", vec![batch, length]),
+        ] {
+            let found = tensors.get(name)?.shape();
+            if found != shape {
+                let (found, expected) = (format!("{found:?}"), format!("{shape:?}, as the metadata says"));
+                return Err(TensorsError::Unexpected { name: name.to_owned(), found, expected }.into());
             }
         }
         for (key, found, least) in [("length", length, 3), ("horizon", horizon, 2)] {
