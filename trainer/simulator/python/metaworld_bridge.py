@@ -317,14 +317,16 @@ class Look:
 
 def random_pattern(random, height, width):
     """Two colours in blocks, stripes or blotches. [height, width, 3] u8."""
-    cells = int(random.integers(4, 17))
+    columns_of_cells = int(random.integers(4, 17))
+    row, column = np.arange(height) * columns_of_cells // width, np.arange(width) * columns_of_cells // width
+    cells = np.indices((row[-1] + 1, columns_of_cells))
     kind = random.choice(["checks", "stripes", "blotches"])
-    rows, columns = np.arange(height)[:, None] * cells // width, np.arange(width)[None] * cells // width
     if kind == "checks":
-        share = ((rows + columns) % 2).astype(float)
+        share = cells.sum(0) % 2
     elif kind == "stripes":
-        share = np.broadcast_to((columns if random.random() < 0.5 else rows) % 2, (height, width)).astype(float)
+        share = cells[random.integers(2)] % 2
     else:
-        share = random.random((int(rows[-1, 0]) + 1, cells))[rows, columns]
+        share = random.random(cells.shape[1:])
     one, other = random.integers(0, 256, (2, 3))
-    return (share[..., None] * one + (1 - share[..., None]) * other).astype(np.uint8)
+    colours = (share[..., None] * one + (1 - share[..., None]) * other).astype(np.uint8)
+    return colours[row[:, None], column]

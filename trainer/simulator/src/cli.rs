@@ -126,6 +126,19 @@ fn rate(text: &str) -> Result<f64, String> {
 }
 
 impl ServeArguments {
+    /// Refuses combinations that make no sense together.
+    pub fn check(&self) -> anyhow::Result<()> {
+        anyhow::ensure!(
+            !self.free_run || self.policy.is_scripted(),
+            "--free-run waits for no controller: choose --policy expert, random or mixed"
+        );
+        anyhow::ensure!(
+            !self.free_run || matches!(self.pace, PaceName::Lockstep),
+            "--free-run has no clock: leave out --pace realtime"
+        );
+        Ok(())
+    }
+
     /// What to simulate.
     pub fn environment(&self) -> EnvironmentSettings {
         EnvironmentSettings {

@@ -37,6 +37,7 @@ fn main() -> ExitCode {
 
 fn run_serve(arguments: &ServeArguments) -> Result<()> {
     task_id(&arguments.task)?;
+    arguments.check()?;
     let stop = stop_flag()?;
     if let Some(folder) = &arguments.snapshot {
         std::fs::create_dir_all(folder).with_context(|| format!("creating {}", folder.display()))?;

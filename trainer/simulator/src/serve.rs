@@ -235,8 +235,8 @@ impl Server<'_> {
         observation.step = step;
         observation.executed_action = executed;
         observation.scheduled_ns = match self.settings.pace {
-            Pace::RealTime { .. } => scheduled_ns,
-            Pace::LockStep | Pace::Free => monotonic_ns(),
+            Pace::RealTime { .. } if !repeated => scheduled_ns,
+            _ => monotonic_ns(),
         };
         observation.period_ns = match self.settings.pace {
             Pace::RealTime { period_ns } => period_ns,

@@ -26,6 +26,12 @@ fn an_unknown_task_ends_with_one_line_that_names_the_near_ones() {
 }
 
 #[test]
+fn a_free_run_without_anybody_to_decide_is_refused() {
+    let output = simulator().args(["serve", "--task", "reach", "--free-run"]).output().unwrap();
+    assert!(failure(&output).contains("--policy expert"));
+}
+
+#[test]
 fn all_tasks_are_listed_with_their_role() {
     let output = simulator().args(["tasks", "--json", "-"]).output().unwrap();
     let tasks: Vec<serde_json::Value> = serde_json::from_slice(&output.stdout).unwrap();
