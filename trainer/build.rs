@@ -8,7 +8,8 @@ fn main() {
     let revision = git(&["rev-parse", "--short=12", "HEAD"]).map_or_else(
         || "unknown".to_owned(),
         |commit| {
-            let changed = git(&["status", "--porcelain", "--", ".", "../models"]).is_none_or(|text| !text.is_empty());
+            let changed =
+                git(&["status", "--porcelain", "--", ".", "../models"]).is_none_or(|text| !text.is_empty());
             if changed { format!("{commit}-modified") } else { commit }
         },
     );
