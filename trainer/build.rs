@@ -4,7 +4,7 @@ use std::path::Path;
 use std::process::Command;
 
 /// What the exported graphs depend on.
-const SOURCES: [&str; 2] = [".", "../models"];
+const SOURCES: [&str; 2] = ["src", "../models/src"];
 /// Grows with every commit.
 const GIT_LOG: &str = "../.git/logs/HEAD";
 
