@@ -77,6 +77,10 @@ impl SimulatorLink {
     /// [`LinkError::Traffic`].
     pub fn send(&self, mut slot: ObservationSlot) -> Result<(), LinkError> {
         slot.published_ns = monotonic_ns();
+        if slot.period_ns == 0 {
+            // In lock-step nothing is due at a time of its own.
+            slot.scheduled_ns = slot.published_ns;
+        }
         slot.sample.send().map_err(traffic("publishing an observation"))?;
         self.observations.notify(EVENT_PUBLISHED)
     }
