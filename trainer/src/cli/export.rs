@@ -18,7 +18,7 @@ use serde::Serialize;
 #[derive(Debug, clap::Args)]
 #[command(after_help = "Examples:
   rcwm-trainer export --checkpoint runs/untrained --out bundles/untrained
-  rcwm-trainer export --checkpoint runs/hammer --out bundles/hammer --task hammer --golden-episode episode.npz --force")]
+  rcwm-trainer export --checkpoint runs/hammer --out bundles/hammer --task hammer --force")]
 pub struct Export {
     /// Folder of the checkpoint
     #[arg(long, value_name = "DIR")]

@@ -9,7 +9,7 @@ use serde::Serialize;
 #[derive(Debug, clap::Args)]
 #[command(after_help = "Examples:
   rcwm-trainer parity tests/data/rcwm-small.safetensors
-  rcwm-trainer parity tests/data/rcwm-small.safetensors --group observe --group imagine --json parity.json")]
+  rcwm-trainer parity tests/data/rcwm-small.safetensors --group observe --json parity.json")]
 pub struct Parity {
     /// The reference file
     file: PathBuf,
