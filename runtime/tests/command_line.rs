@@ -99,7 +99,7 @@ fn a_library_that_is_not_onnx_runtime_is_an_error_not_a_hang() {
 fn a_run_that_nobody_talks_to_ends_with_its_own_exit_code() {
     let link = own_link();
     let mut command = runtime();
-    command.env("RCWM_PREFIX", link.prefix.unwrap());
+    command.env("RCWM_PREFIX", link.prefix());
     command.args(["run", "--instance", "silent", "--timeout", "0.3", "--bundle"]).arg(smallest_bundle());
     let error = error_of(&mut command, 3);
     assert!(error.contains("rcwm-simulator serve --instance silent"), "{error}");

@@ -3,7 +3,7 @@
 mod support;
 
 use rcwm_models::bundle::PartName;
-use rcwm_models::wire::{ActionSource, ObservationFlags, SimulatorLink};
+use rcwm_models::wire::{ActionSource, ObservationFlags};
 use rcwm_runtime::controller::{Ended, Fallback};
 use rcwm_runtime::telemetry::Stage;
 use rcwm_runtime::{EngineSettings, Policy};
@@ -14,7 +14,7 @@ use support::{
 #[test]
 fn every_observation_is_answered_with_what_the_policy_decides() {
     let link = own_link();
-    let peer = SimulatorLink::open(link.clone()).unwrap();
+    let peer = link.peer();
     let controller = start_controller(&smallest_bundle(), &link, Fallback::Hold);
     let mut policy = Policy::load(&smallest_bundle(), EngineSettings::tract()).unwrap();
     for sequence in 0..40 {
@@ -37,7 +37,7 @@ fn every_observation_is_answered_with_what_the_policy_decides() {
 #[test]
 fn a_repeated_observation_gets_the_same_answer_without_a_second_tick() {
     let link = own_link();
-    let peer = SimulatorLink::open(link.clone()).unwrap();
+    let peer = link.peer();
     let controller = start_controller(&smallest_bundle(), &link, Fallback::Hold);
     ask(&peer, &observation(0, 0));
     let first = ask(&peer, &observation(1, 1));
@@ -57,7 +57,7 @@ fn a_repeated_observation_gets_the_same_answer_without_a_second_tick() {
 #[test]
 fn a_stale_observation_is_dropped_and_a_gap_is_counted() {
     let link = own_link();
-    let peer = SimulatorLink::open(link.clone()).unwrap();
+    let peer = link.peer();
     let controller = start_controller(&smallest_bundle(), &link, Fallback::Hold);
     ask(&peer, &observation(0, 0));
     ask(&peer, &observation(4, 4));
@@ -78,7 +78,7 @@ fn an_output_that_is_not_finite_never_reaches_the_wire() {
     for part in PartName::REQUIRED {
         let bundle = dividing_by_zero(part);
         let link = own_link();
-        let peer = SimulatorLink::open(link.clone()).unwrap();
+        let peer = link.peer();
         let controller = start_controller(bundle.path(), &link, Fallback::Hold);
         for sequence in 0..3 {
             let action = ask(&peer, &observation(sequence, sequence as u32));
@@ -94,7 +94,7 @@ fn an_output_that_is_not_finite_never_reaches_the_wire() {
 fn an_observation_that_is_not_finite_is_refused_and_the_last_action_held() {
     for (fallback, held) in [(Fallback::Hold, true), (Fallback::Zero, false)] {
         let link = own_link();
-        let peer = SimulatorLink::open(link.clone()).unwrap();
+        let peer = link.peer();
         let controller = start_controller(&smallest_bundle(), &link, fallback);
         let good = ask(&peer, &observation(0, 0));
         let mut bad = observation(1, 1);
@@ -115,7 +115,7 @@ fn the_bundle_s_action_limits_hold_for_every_source() {
         manifest.control.action_high = [0.5, 0.001, -0.75, -0.9];
     });
     let link = own_link();
-    let peer = SimulatorLink::open(link.clone()).unwrap();
+    let peer = link.peer();
     let controller = start_controller(narrow.path(), &link, Fallback::Zero);
     for sequence in 0..5 {
         let mut sent = observation(sequence, sequence as u32);
@@ -134,13 +134,13 @@ fn the_bundle_s_action_limits_hold_for_every_source() {
 #[test]
 fn a_simulator_that_was_started_again_is_served_from_its_first_observation() {
     let link = own_link();
-    let peer = SimulatorLink::open(link.clone()).unwrap();
+    let peer = link.peer();
     let controller = start_controller(&smallest_bundle(), &link, Fallback::Hold);
     let first = ask(&peer, &observation(0, 0));
     ask(&peer, &observation(1, 1));
     // Gone without a word.
     drop(peer);
-    let peer = SimulatorLink::open(link.clone()).unwrap();
+    let peer = link.peer();
     assert_eq!(ask(&peer, &observation(0, 0)).action, first.action);
     peer.close().unwrap();
     let report = controller.join().unwrap();
@@ -151,7 +151,7 @@ fn a_simulator_that_was_started_again_is_served_from_its_first_observation() {
 #[test]
 fn a_late_answer_in_real_time_is_a_missed_deadline() {
     let link = own_link();
-    let peer = SimulatorLink::open(link.clone()).unwrap();
+    let peer = link.peer();
     let controller = start_controller(&smallest_bundle(), &link, Fallback::Hold);
     for sequence in 0..4 {
         let mut sent = observation(sequence, sequence as u32);

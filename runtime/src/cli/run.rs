@@ -10,7 +10,7 @@ use rcwm_models::bundle::Bundle;
 use rcwm_models::wire::LinkSettings;
 
 use super::status::StatusLine;
-use crate::controller::{Controller, ControllerSettings, Fallback, TickObserver};
+use crate::controller::{Controller, ControllerSettings, Ended, Fallback, TickObserver};
 use crate::engine::{EngineKind, EngineSettings};
 use crate::policy::{Policy, Sampling};
 use crate::record::{Recorded, Recorder};
@@ -85,18 +85,18 @@ pub(super) fn run(arguments: &RunArguments) -> anyhow::Result<()> {
     let policy = Policy::new(&bundle, engine, sampling)?;
     let mut recorder = start_recorder(arguments, &bundle, engine)?;
     let mut controller = Controller::open(policy, arguments.controller_settings())?;
-    let ended = control(&mut controller, arguments, recorder.as_mut(), &stop);
-    let report = ended.as_ref().ok().map(|ended| controller.report(arguments.engine, *ended));
+    let result = control(&mut controller, arguments, recorder.as_mut(), &stop);
+    let mut report = controller.report(arguments.engine, *result.as_ref().unwrap_or(&Ended::Failed));
     // The simulator is told before anything slow is done.
     let closed = controller.close();
-    let dropped = recorder.as_ref().map_or(0, Recorder::dropped);
-    let recorded = finish_recorder(recorder)?;
-    ended?;
-    if let Some(mut report) = report {
-        report.frames_dropped = dropped;
-        print!("{}{}", report.summary(), recorded_lines(&recorded));
+    report.frames_dropped = recorder.as_ref().map_or(0, Recorder::dropped);
+    let recorded = finish_recorder(recorder);
+    if report.counters.observations > 0 || result.is_ok() {
+        print!("{}", report.summary());
         super::write_json(arguments.json.as_ref(), &report)?;
     }
+    result?;
+    print!("{}", recorded_lines(&recorded?));
     Ok(closed?)
 }
 
@@ -118,7 +118,7 @@ fn control(
     arguments: &RunArguments,
     recorder: Option<&mut Recorder>,
     stop: &AtomicBool,
-) -> anyhow::Result<crate::controller::Ended> {
+) -> anyhow::Result<Ended> {
     let mut status = StatusLine::start(&arguments.instance).context("starting the status line")?;
     let mut observers: Vec<&mut dyn TickObserver> = vec![&mut status];
     if let Some(recorder) = recorder {

@@ -91,7 +91,11 @@ impl Drop for StatusLine {
 
 /// Draws until the sender is gone. Without a terminal only whole lines are printed.
 fn draw(messages: &Receiver<Message>, waiting: String) {
-    let bar = indicatif::ProgressBar::new_spinner().with_message(waiting);
+    let bar = indicatif::ProgressBar::new_spinner();
+    if bar.is_hidden() {
+        eprintln!("{waiting}");
+    }
+    bar.set_message(waiting);
     bar.enable_steady_tick(UPDATE);
     while let Ok(message) = messages.recv() {
         match message {

@@ -85,6 +85,8 @@ pub enum Ended {
     Episodes,
     /// The user asked for it.
     Interrupted,
+    /// An error ended it.
+    Failed,
 }
 
 /// What happened in one tick; shown to observers after the action was sent.

@@ -13,8 +13,11 @@ use rcwm_models::IMAGE_BYTES;
 use rcwm_models::bundle::{Bundle, MANIFEST_FILE, Manifest, PartName};
 use rcwm_models::files::sha256_hex;
 use rcwm_models::onnx::{Graph, Model, Node, Tensor, data_type};
-use rcwm_models::wire::{Action, LinkSettings, Observation, ObservationFlags, SimulatorLink, Wait};
+use rcwm_models::wire::{
+    Action, LinkSettings, Observation, ObservationFlags, SimulatorLink, Wait, forget_prefix,
+};
 use rcwm_runtime::controller::{Controller, ControllerSettings, Fallback, RunReport};
+use rcwm_runtime::record::{Recorded, Recorder};
 use rcwm_runtime::{EngineKind, EngineSettings, Policy};
 
 /// Far longer than anything here takes: reached only when an answer never comes.
@@ -91,29 +94,63 @@ pub fn dividing_by_zero(part: PartName) -> tempfile::TempDir {
     })
 }
 
+/// A link that no other test shares; nothing of it is left when this is dropped.
+pub struct OwnLink(pub LinkSettings);
+
 /// A link that no other test shares.
-pub fn own_link() -> LinkSettings {
+pub fn own_link() -> OwnLink {
     static COUNT: AtomicU32 = AtomicU32::new(0);
     let number = COUNT.fetch_add(1, Ordering::Relaxed);
     let prefix = Some(format!("rt{}_{number}_", std::process::id()));
-    LinkSettings { prefix, ..LinkSettings::new("test") }
+    OwnLink(LinkSettings { prefix, ..LinkSettings::new("test") })
+}
+
+impl OwnLink {
+    /// Connects a peer that plays the simulator.
+    pub fn peer(&self) -> SimulatorLink {
+        SimulatorLink::open(self.0.clone()).unwrap()
+    }
+
+    pub fn prefix(&self) -> &str {
+        self.0.prefix.as_deref().unwrap()
+    }
+}
+
+impl Drop for OwnLink {
+    fn drop(&mut self) {
+        forget_prefix(self.prefix());
+    }
 }
 
 /// Starts a controller of a bundle; it ends when the peer closes, and gives its report.
-pub fn start_controller(bundle: &Path, link: &LinkSettings, fallback: Fallback) -> JoinHandle<RunReport> {
-    let policy = Policy::load(bundle, EngineSettings::tract()).unwrap();
-    let settings = ControllerSettings {
-        link: link.clone(),
-        episodes_max: None,
-        stay: false,
-        first_timeout: Some(NEVER),
-        fallback,
-    };
-    std::thread::spawn(move || {
-        let mut controller = Controller::open(policy, settings).unwrap();
+pub fn start_controller(bundle: &Path, link: &OwnLink, fallback: Fallback) -> JoinHandle<RunReport> {
+    start(bundle, link, fallback, |controller| {
         let ended = controller.run(&AtomicBool::new(false), &mut []).unwrap();
         controller.report(EngineKind::Tract, ended)
     })
+}
+
+/// The same with a recorder into a folder; gives what was recorded.
+pub fn start_recording(bundle: &Path, link: &OwnLink, folder: &Path) -> JoinHandle<Recorded> {
+    let checked = Bundle::open(bundle).unwrap();
+    let mut recorder = Recorder::start(folder, 10, &checked, EngineSettings::tract()).unwrap();
+    start(bundle, link, Fallback::Hold, move |controller| {
+        controller.run(&AtomicBool::new(false), &mut [&mut recorder]).unwrap();
+        recorder.finish().unwrap()
+    })
+}
+
+fn start<T: Send + 'static>(
+    bundle: &Path,
+    link: &OwnLink,
+    fallback: Fallback,
+    run: impl FnOnce(&mut Controller) -> T + Send + 'static,
+) -> JoinHandle<T> {
+    let policy = Policy::load(bundle, EngineSettings::tract()).unwrap();
+    let first_timeout = Some(NEVER);
+    let link = link.0.clone();
+    let settings = ControllerSettings { link, episodes_max: None, stay: false, first_timeout, fallback };
+    std::thread::spawn(move || run(&mut Controller::open(policy, settings).unwrap()))
 }
 
 /// An observation of an episode that begins at step 0, with an image of its own.
