@@ -9,7 +9,7 @@
 //! | [`record`] | films, strips and episodes of what the policy saw, written beside the loop |
 //! | [`verify`] | a bundle against its golden values |
 //! | [`inspect`] | what a bundle holds and what a tick costs |
-//! | [`bench`] | the tick's latency on this machine, engines interleaved |
+//! | [`mod@bench`] | the tick's latency on this machine, engines interleaved |
 //!
 //! A policy without shared memory:
 //!

@@ -153,12 +153,18 @@ fn a_late_answer_in_real_time_is_a_missed_deadline() {
     let link = own_link();
     let peer = link.peer();
     let controller = start_controller(&smallest_bundle(), &link, Fallback::Hold);
-    for sequence in 0..4 {
-        let mut sent = observation(sequence, sequence as u32);
-        // Due at the beginning of time and a nanosecond long: no answer can be in time. Then: due for ever.
-        (sent.scheduled_ns, sent.period_ns) = if sequence < 2 { (0, 1) } else { (0, u64::MAX) };
+    // The first lasts a nanosecond: the answer is late even from when it was published. The second lasts 10 s and was due
+    // 20 s ago: only the simulator is late. The third is due for ever.
+    const LONG_NS: u64 = 10_000_000_000;
+    let long_ago = rcwm_models::wire::clock::monotonic_ns().saturating_sub(2 * LONG_NS);
+    for (sequence, (scheduled_ns, period_ns)) in
+        [(0, 1), (long_ago, LONG_NS), (0, u64::MAX)].into_iter().enumerate()
+    {
+        let mut sent = observation(sequence as u64, sequence as u32);
+        (sent.scheduled_ns, sent.period_ns) = (scheduled_ns, period_ns);
         ask(&peer, &sent);
     }
     peer.close().unwrap();
-    assert_eq!(controller.join().unwrap().counters.missed_deadlines, 2);
+    let counters = controller.join().unwrap().counters;
+    assert_eq!((counters.missed_deadlines, counters.missed_deadlines_published_late), (2, 1));
 }

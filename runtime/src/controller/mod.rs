@@ -323,6 +323,8 @@ impl Controller {
         let ours = period_ns > 0 && !observation.is(ObservationFlags::REPEATED);
         let missed = ours && sent_ns > observation.scheduled_ns.saturating_add(period_ns);
         self.counters.missed_deadlines += u64::from(missed);
+        let in_time = sent_ns.saturating_sub(observation.published_ns) <= period_ns;
+        self.counters.missed_deadlines_published_late += u64::from(missed && in_time);
     }
 
     fn count_episode(&mut self, observation: &Observation, is_first: bool) {

@@ -33,6 +33,8 @@ pub struct Counters {
     pub engine_errors: u64,
     /// Actions published later than a period after their observation was due (real time).
     pub missed_deadlines: u64,
+    /// Those of them that were answered within a period: the simulator itself had published late.
+    pub missed_deadlines_published_late: u64,
     /// Another simulator took over the instance.
     pub peer_restarts: u64,
 }
@@ -224,14 +226,15 @@ impl RunReport {
     fn counter_lines(&self) -> String {
         let c = &self.counters;
         let mut text = format!(
-            "counts     observations {}, answers {}, repeated {}, stale {}, missed observations {}, missed deadlines {}, \
-             peer restarts {}\n",
+            "counts     observations {}, answers {}, repeated {}, stale {}, missed observations {}, missed deadlines {} ({} \
+             of them published late), peer restarts {}\n",
             c.observations,
             c.answers,
             c.repeated_observations,
             c.stale_observations,
             c.missed_observations,
             c.missed_deadlines,
+            c.missed_deadlines_published_late,
             c.peer_restarts
         );
         text += &format!(

@@ -15,6 +15,9 @@ use crate::policy::State;
 /// Longest film, in ticks; longer episodes are filmed to here and kept whole as `.npz`.
 const FILM_TICKS_MAX: usize = 1000;
 
+/// Niceness of the recording thread: Linux keeps one per thread.
+const NICENESS: i32 = 10;
+
 pub(super) struct Worker {
     folder: PathBuf,
     decoder: Option<Box<dyn Part>>,
@@ -47,6 +50,8 @@ impl Worker {
     }
 
     pub(super) fn run(mut self, frames: &Receiver<Box<Frame>>) -> Result<Recorded, RecordError> {
+        // Drawing must not take the processor from the loop; where that is not granted, it is drawn as fast as may be.
+        let _ = rustix::process::setpriority_process(Some(rustix::thread::gettid()), NICENESS);
         while let Ok(frame) = frames.recv() {
             if frame.is_first {
                 self.finish()?;
