@@ -4,7 +4,8 @@
 //! | --- | --- |
 //! | [`ops`] | differentiable primitives |
 //! | [`model`] | RCWM and the vanilla baseline |
-//! | [`behaviour`] | imagination with the actor, returns |
+//! | [`learning`] | losses, gradients and updates of the world model |
+//! | [`behaviour`] | imagination with the actor, returns, actor and critic updates |
 //! | [`checkpoint`] | weights and settings on disk |
 //! | [`parity`] | our numbers against the authors' |
 //!
@@ -12,6 +13,7 @@
 
 pub mod behaviour;
 pub mod checkpoint;
+pub mod learning;
 pub mod model;
 pub mod ops;
 pub mod parity;
