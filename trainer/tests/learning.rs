@@ -1,5 +1,7 @@
 //! Learning: the authors' numbers, who gets a gradient in which phase, and that the same seed gives the same weights.
 
+#![allow(clippy::unwrap_used)]
+
 use std::path::Path;
 
 use candle_core::{Device, Tensor};
@@ -183,7 +185,7 @@ fn a_loss_that_is_not_finite_leaves_the_parameters_as_they_were() {
     let mut learner =
         WorldLearner::new(&parameters, &model, &WorldSettings::default(), Trained::World).unwrap();
     let mut batch = batch(1, 2, false);
-    batch.action = (batch.action * f64::NAN).unwrap();
+    batch.terminal = (batch.terminal * f64::NAN).unwrap();
     let error = learner.update(&batch, &mut Sampler::seeded(1)).unwrap_err();
     assert!(error.to_string().contains("resume from the last checkpoint"), "{error}");
     assert_eq!(values(&parameters), before);

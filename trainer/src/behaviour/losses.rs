@@ -25,9 +25,10 @@ pub fn critic_loss(critic: &TwoHotHead, slow: &TwoHotHead, imagined: &Imaginatio
     let steps = imagined.returns.dim(0)?;
     let features = imagined.features.narrow(0, 0, steps)?.detach();
     let slow_value = slow.mean(&slow.logits(&features)?)?;
-    let bins = critic.bins();
+    let logits = critic.logits(&features)?; // [L-1, N, bins]
+    let bins = logits.dim(2)?;
     // Both are cross-entropies of the same logits: the targets add up.
-    let target = (two_hot(&imagined.returns, bins)? + two_hot(&slow_value, bins)?)?; // [L-1, N, bins]
-    let loss = cross_entropy(&critic.logits(&features)?, &target)?; // [L-1, N]
+    let target = (two_hot(&imagined.returns, bins)? + two_hot(&slow_value, bins)?)?;
+    let loss = cross_entropy(&logits, &target)?; // [L-1, N]
     (imagined.weights.narrow(0, 0, steps)?.squeeze(2)? * loss)?.mean_all()
 }

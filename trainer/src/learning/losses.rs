@@ -69,9 +69,9 @@ pub fn world_losses(
         Some(mask) => Some(pixel_loss(&decoded.pictures[0].mask, &mask.to_dtype(DType::F32)?)?),
         None => None,
     };
-    let reward = &agent.heads.reward;
-    let target = two_hot(&batch.reward.unsqueeze(2)?, reward.bins())?; // [B, T, bins]
-    let reward = cross_entropy(&reward.logits(&features)?, &target)?.mean_all()?;
+    let reward = agent.heads.reward.logits(&features)?; // [B, T, bins]
+    let target = two_hot(&batch.reward.unsqueeze(2)?, reward.dim(2)?)?;
+    let reward = cross_entropy(&reward, &target)?.mean_all()?;
     let continues = continue_loss(&agent.heads.continue_logit(&features)?, &batch.terminal)?;
     let branches = observed
         .posteriors

@@ -2,16 +2,17 @@ use candle_core::{D, Result, Tensor};
 
 use crate::ops::{self, TWO_HOT_LIMIT};
 
-/// Values [..., 1] as weights [..., count] of the two nearest bins in symlog space, which sum to 1 and whose mean is the
-/// value; values beyond the outermost bin count as that bin. Without gradient.
+/// Values [..., 1] as weights [..., count] of the two nearest of `count` bins in symlog space, which sum to 1 and whose mean is
+/// the value; values beyond the outermost bin count as that bin. Without gradient.
 ///
 /// # Errors
 /// Those of candle.
-pub fn two_hot(values: &Tensor, bins: &Tensor) -> Result<Tensor> {
-    let width = 2.0 * TWO_HOT_LIMIT / (bins.dim(0)? - 1) as f64;
-    let x = ops::symlog(&values.detach())?.clamp(-TWO_HOT_LIMIT, TWO_HOT_LIMIT)?;
-    // The bins are evenly spaced: a bin's weight falls linearly to 0 over one width.
-    x.broadcast_sub(bins)?.abs()?.affine(-1.0 / width, 1.0)?.relu()
+pub fn two_hot(values: &Tensor, count: usize) -> Result<Tensor> {
+    let half = (count / 2) as f64;
+    let places = Tensor::arange(-half as f32, half as f32 + 1.0, values.device())?;
+    let place = (ops::symlog(&values.detach())? * (half / TWO_HOT_LIMIT))?.clamp(-half, half)?;
+    // The bins are evenly spaced: a bin's weight falls linearly to 0 on the way to its neighbours.
+    place.broadcast_sub(&places)?.abs()?.affine(-1.0, 1.0)?.relu()
 }
 
 /// Cross-entropy of the distribution given by `logits` [..., count] against the weights `target` [..., count]: [...].
@@ -30,9 +31,9 @@ mod tests {
     #[test]
     fn two_neighbours_share_the_weight_and_their_mean_is_the_value() {
         let device = Device::Cpu;
-        let bins = ops::bins(255, &device).unwrap();
+        let bins = (Tensor::arange(-127f32, 128f32, &device).unwrap() * (TWO_HOT_LIMIT / 127.0)).unwrap();
         let values = [-3000f32, -0.3, 0.0, 0.05, 7.0, 1e9];
-        let weights = two_hot(&Tensor::new(&values, &device).unwrap().unsqueeze(1).unwrap(), &bins).unwrap();
+        let weights = two_hot(&Tensor::new(&values, &device).unwrap().unsqueeze(1).unwrap(), 255).unwrap();
         let means = ops::symexp(&weights.broadcast_mul(&bins).unwrap().sum(1).unwrap()).unwrap();
         let (rows, means) = (weights.to_vec2::<f32>().unwrap(), means.to_vec1::<f32>().unwrap());
         for ((row, mean), value) in rows.iter().zip(&means).zip(values) {

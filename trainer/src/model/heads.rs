@@ -35,12 +35,6 @@ impl TwoHotHead {
         self.mlp.forward(features)
     }
 
-    /// The bins in symlog space, [bins].
-    #[must_use]
-    pub fn bins(&self) -> &Tensor {
-        &self.bins
-    }
-
     /// Mean of the distribution given by logits [..., bins]: [..., 1].
     ///
     /// # Errors

@@ -32,9 +32,9 @@ pub struct Decoded {
 #[derive(Debug, Clone)]
 pub enum World {
     /// The paper's.
-    Rcwm(Rcwm),
+    Rcwm(Box<Rcwm>),
     /// The baseline.
-    Vanilla(Vanilla),
+    Vanilla(Box<Vanilla>),
 }
 
 impl World {
@@ -44,8 +44,8 @@ impl World {
     /// Those of [`Scope::get`].
     pub fn new(scope: &Scope<'_>, settings: &ModelSettings) -> Built<Self> {
         Ok(match settings.kind {
-            ModelKind::Rcwm => Self::Rcwm(Rcwm::new(scope, settings)?),
-            ModelKind::Vanilla => Self::Vanilla(Vanilla::new(scope, settings)?),
+            ModelKind::Rcwm => Self::Rcwm(Box::new(Rcwm::new(scope, settings)?)),
+            ModelKind::Vanilla => Self::Vanilla(Box::new(Vanilla::new(scope, settings)?)),
         })
     }
 

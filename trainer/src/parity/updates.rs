@@ -64,7 +64,7 @@ impl Updates {
             Group::BehaviourGrad => named(behaviour.actor.iter().chain(behaviour.critic.iter())),
             Group::Updated => {
                 let trained = Trained::World.filter();
-                vars(&self.world.updated, |name| trained(name))
+                vars(&self.world.updated, trained)
             }
             Group::BehaviourUpdated => {
                 let trained = Trained::World.filter();
