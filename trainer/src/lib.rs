@@ -6,6 +6,8 @@
 //! | [`model`] | RCWM and the vanilla baseline |
 //! | [`learning`] | losses, gradients and updates of the world model |
 //! | [`behaviour`] | imagination with the actor, returns, actor and critic updates |
+//! | [`replay`] | experience in memory, batches drawn from it |
+//! | [`training`] | runs: phases, metrics, checkpoints, resuming |
 //! | [`checkpoint`] | weights and settings on disk |
 //! | [`parity`] | our numbers against the authors' |
 //!
@@ -17,3 +19,5 @@ pub mod learning;
 pub mod model;
 pub mod ops;
 pub mod parity;
+pub mod replay;
+pub mod training;
