@@ -126,6 +126,7 @@ fn a_stopped_run_is_saved_where_it_was() {
     assert_eq!(stored.settings.updates, 7);
     assert!(folder.path().join("checkpoints/best/checkpoint.toml").exists());
     let files = fs::read_dir(Run::last(folder.path())).unwrap().count();
+    assert!(folder.path().join("films/000007-reach.png").exists());
     assert_eq!(files, 3, "checkpoint.toml, one file of weights, one of the optimiser");
 }
 

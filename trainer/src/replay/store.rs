@@ -96,10 +96,10 @@ impl Replay {
     }
 
     /// The tasks with their episodes, oldest first.
-    pub fn tasks(&self) -> impl Iterator<Item = (&str, Vec<&Episode>)> {
-        self.tasks.iter().map(|(name, task)| {
-            (name.as_str(), task.episodes.iter().map(|stored| &*stored.episode).collect())
-        })
+    pub fn tasks(&self) -> impl Iterator<Item = (&str, Vec<&Arc<Episode>>)> {
+        self.tasks
+            .iter()
+            .map(|(name, task)| (name.as_str(), task.episodes.iter().map(|stored| &stored.episode).collect()))
     }
 
     /// Adds an episode; where there is no room, the oldest episodes of the task with the most steps leave.

@@ -6,6 +6,7 @@
 //! settings.toml        everything that was chosen, resolved; --resume goes on from it
 //! metrics.jsonl        one line for every `metrics_every` updates: the truth
 //! checkpoints/last/    weights, settings and the optimiser's state; the newest
+//! films/               000500-reach.png: what the model imagines of one episode a task, with every checkpoint
 //! checkpoints/best/    the one with the lowest mask-free loss over an interval between checkpoints
 //! ```
 //!
@@ -17,13 +18,16 @@
 //! | `settings` | what can be chosen, presets |
 //! | `state` | what a checkpoint holds beside the weights |
 //! | `run` | the folder: settings, metrics, checkpoints |
+//! | `film` | film strips of the open loop |
 //! | `pretrain` | the phase: mask warm-up, then mask-free updates |
 
+mod film;
 mod pretrain;
 mod run;
 mod settings;
 mod state;
 
+pub use film::{FilmSettings, film_strip, write_png};
 pub use pretrain::{Outcome, Pretraining, Progress};
 pub use run::{Metrics, Run};
 pub use settings::{PretrainSettings, ReplaySettings, TrainingSettings};

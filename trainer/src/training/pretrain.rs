@@ -1,12 +1,14 @@
 use std::path::Path;
+use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, Ordering};
 use std::time::Instant;
 
 use candle_core::Device;
+use rcwm_models::episode::Episode;
 
-use super::{Metrics, Run, TrainingError, TrainingSettings, TrainingState};
+use super::{Metrics, Run, TrainingError, TrainingSettings, TrainingState, film_strip, write_png};
 use crate::learning::{LossValues, Trained, WorldLearner, WorldUpdate};
-use crate::model::agent;
+use crate::model::agent::{self, Agent};
 use crate::model::latent::Sampler;
 use crate::model::parameters::Parameters;
 use crate::replay::{Prefetch, Replay};
@@ -15,6 +17,9 @@ use crate::replay::{Prefetch, Replay};
 const WORLD: &str = "world";
 /// What sets the replay's stream of draws apart from the sampler's under the same seed.
 const REPLAY_STREAM: u64 = 0x7265_706c_6179;
+
+/// A task and an episode of it to make films of.
+type Scene = (String, Arc<Episode>);
 
 /// Pre-training of the world model (spec: phases 2): masked warm-up, then mask-free updates.
 #[derive(Debug)]
@@ -113,6 +118,7 @@ impl Pretraining {
         stop: &AtomicBool,
         mut show: impl FnMut(&Progress<'_>),
     ) -> Result<Outcome, TrainingError> {
+        let scenes = self.scenes(&replay);
         let mut batches = self.prefetch(replay)?;
         let mut interval = Interval::begin(&batches);
         let mut since_checkpoint = Means::default();
@@ -133,13 +139,13 @@ impl Pretraining {
             }
             let saved = self.state.updates.is_multiple_of(self.settings.checkpoint_every);
             if saved {
-                self.save(std::mem::take(&mut since_checkpoint))?;
+                self.save(std::mem::take(&mut since_checkpoint), &scenes)?;
                 saved_at = Some(self.state.updates);
             }
             show(&Progress { updates: self.state.updates, metrics: metrics.as_ref(), saved });
         }
         if saved_at != Some(self.state.updates) {
-            self.save(since_checkpoint)?;
+            self.save(since_checkpoint, &scenes)?;
         }
         let interrupted = self.state.updates < self.settings.pretrain.updates;
         Ok(Outcome { updates: self.state.updates, interrupted })
@@ -157,7 +163,7 @@ impl Pretraining {
     }
 
     /// Saves a checkpoint; it is the best if the mask-free updates since the last one had the lowest mean loss so far.
-    fn save(&mut self, since: Means) -> Result<(), TrainingError> {
+    fn save(&mut self, since: Means, scenes: &[Scene]) -> Result<(), TrainingError> {
         let loss = since.mask_free_loss();
         let is_best = match (loss, self.state.best_loss) {
             (Some(loss), Some(best)) => loss < best,
@@ -168,7 +174,24 @@ impl Pretraining {
             self.state.best_loss = loss;
         }
         let optimisers = [(WORLD, self.learner.adam())];
-        self.run.save(&self.parameters, &self.settings, &self.state, &optimisers, is_best)
+        self.run.save(&self.parameters, &self.settings, &self.state, &optimisers, is_best)?;
+        let agent = Agent::new(&self.parameters.frozen(), &self.settings.model)?;
+        for (task, episode) in scenes {
+            let strip = film_strip(&agent, episode, &self.settings.film, &self.device)?;
+            write_png(&strip, &self.run.film(self.state.updates, task)?)?;
+        }
+        Ok(())
+    }
+
+    /// The first episode of every task that is long enough to imagine some of.
+    fn scenes(&self, replay: &Replay) -> Vec<Scene> {
+        let film = &self.settings.film;
+        let long = |episode: &&Arc<Episode>| film.length > 0 && episode.len() > film.context;
+        let first = |(task, episodes): (&str, Vec<&Arc<Episode>>)| {
+            let episode = episodes.into_iter().find(long)?;
+            Some((task.to_owned(), Arc::clone(episode)))
+        };
+        replay.tasks().filter_map(first).collect()
     }
 }
 

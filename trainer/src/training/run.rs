@@ -118,6 +118,16 @@ impl Run {
         self.metrics.write_all(&line).map_err(failed(&self.folder.join(METRICS_FILE)))
     }
 
+    /// Where the film strip of a task at this update goes; the folder is made.
+    ///
+    /// # Errors
+    /// Those of making it.
+    pub fn film(&self, updates: u64, task: &str) -> Result<PathBuf, TrainingError> {
+        let films = self.folder.join("films");
+        fs::create_dir_all(&films).map_err(failed(&films))?;
+        Ok(films.join(format!("{updates:06}-{task}.png")))
+    }
+
     /// Saves a checkpoint as the newest one, and as the best if it is. The state is written before the weights that it goes with,
     /// and older states are removed after, so that the folder always holds a whole pair.
     ///

@@ -3,6 +3,7 @@ use std::path::PathBuf;
 use rcwm_models::settings::{ModelKind, ModelSettings, Preset, SettingsError};
 use serde::{Deserialize, Serialize};
 
+use super::FilmSettings;
 use crate::behaviour::BehaviourSettings;
 use crate::learning::WorldSettings;
 
@@ -36,6 +37,9 @@ pub struct TrainingSettings {
     /// Experience and batches.
     #[serde(default)]
     pub replay: ReplaySettings,
+    /// Film strips.
+    #[serde(default)]
+    pub film: FilmSettings,
     /// The pre-training phase.
     #[serde(default)]
     pub pretrain: PretrainSettings,
@@ -116,6 +120,7 @@ impl TrainingSettings {
             world: WorldSettings::default(),
             behaviour: BehaviourSettings::default(),
             replay,
+            film: FilmSettings::default(),
             pretrain,
         }
     }
