@@ -107,10 +107,13 @@ fn a_run_that_died_after_a_checkpoint_repeats_what_was_lost() {
     let metrics = died.join("metrics.jsonl");
     let text = fs::read_to_string(&metrics).unwrap();
     fs::write(&metrics, format!("{text}{{\"update\":6,\"phase\":\"mask_free\"}}\n{{\"upda")).unwrap();
+    let unfinished = Run::last(&died).join(".writing-abc");
+    fs::write(&unfinished, "half a file").unwrap();
     let mut second = Pretraining::resume(&died, settings(ModelKind::Rcwm, 8), &Device::Cpu).unwrap();
     train(&mut second);
     assert!(bits(second.parameters()) == bits(training.parameters()));
     assert_eq!(updates_logged(&died), [2, 4, 6, 8]);
+    assert!(!unfinished.exists());
 }
 
 #[test]

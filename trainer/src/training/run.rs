@@ -73,6 +73,9 @@ impl Run {
                 kept.push('\n');
             }
         }
+        for place in [folder, &folder.join("checkpoints/last"), &folder.join("checkpoints/best")] {
+            remove_unfinished(place).map_err(failed(place))?;
+        }
         write_atomic(&path, kept.as_bytes())?;
         Self::open(folder, settings)
     }
@@ -177,6 +180,20 @@ impl Run {
         let (state, moments) = TrainingState::read(&last, &checkpoint.settings.weights_sha256)?;
         Ok((checkpoint, state, moments))
     }
+}
+
+/// Removes what a run that was killed had begun to write; such files never count, but take room.
+fn remove_unfinished(folder: &Path) -> std::io::Result<()> {
+    if !folder.is_dir() {
+        return Ok(());
+    }
+    for entry in fs::read_dir(folder)? {
+        let entry = entry?;
+        if entry.file_name().to_string_lossy().starts_with(".writing-") {
+            fs::remove_file(entry.path())?;
+        }
+    }
+    Ok(())
 }
 
 fn failed(path: &Path) -> impl FnOnce(std::io::Error) -> TrainingError {
