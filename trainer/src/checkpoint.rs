@@ -125,6 +125,14 @@ pub struct Checkpoint {
 }
 
 impl Checkpoint {
+    /// The checksum that the weights' file will have.
+    ///
+    /// # Errors
+    /// Those of reading the parameters.
+    pub fn weights_sha256(&self) -> Result<String, CheckpointError> {
+        Ok(sha256_hex(&weights_to_bytes(&self.parameters)?))
+    }
+
     /// Writes the checkpoint into `folder`, which is made if it is not there.
     ///
     /// # Errors

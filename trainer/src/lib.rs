@@ -4,7 +4,10 @@
 //! | --- | --- |
 //! | [`ops`] | differentiable primitives |
 //! | [`model`] | RCWM and the vanilla baseline |
-//! | [`behaviour`] | imagination with the actor, returns |
+//! | [`learning`] | losses, gradients and updates of the world model |
+//! | [`behaviour`] | imagination with the actor, returns, actor and critic updates |
+//! | [`replay`] | experience in memory, batches drawn from it |
+//! | [`training`] | runs: phases, metrics, checkpoints, resuming |
 //! | [`checkpoint`] | weights and settings on disk |
 //! | [`export`] | the bundle that a runtime deploys |
 //! | [`parity`] | our numbers against the authors' |
@@ -14,6 +17,9 @@
 pub mod behaviour;
 pub mod checkpoint;
 pub mod export;
+pub mod learning;
 pub mod model;
 pub mod ops;
 pub mod parity;
+pub mod replay;
+pub mod training;

@@ -4,13 +4,15 @@ use super::{Horizon, lambda_return, step_weights};
 use crate::model::agent::Agent;
 use crate::model::latent::{Sampler, State};
 
-/// What the policy does in the model, from N starts over L states; every tensor [L, N, ...] unless it says otherwise.
+/// What the policy does in the model, from N starts over L states.
 #[derive(Debug, Clone)]
 pub struct Imagination {
     /// States s_t, the start first: [L, N, state width].
     pub features: Tensor,
-    /// The action taken in each state: [L, N, action].
+    /// The actions between them: [L-1, N, action].
     pub actions: Tensor,
+    /// Entropy of the distributions they were drawn from: [L-1, N, 1].
+    pub entropy: Tensor,
     /// Predicted reward of each state: [L, N, 1].
     pub reward: Tensor,
     /// The critic's value of each state: [L, N, 1].
@@ -27,24 +29,24 @@ pub struct Imagination {
 /// through the dynamics, but not into the actor's input.
 ///
 /// # Errors
-/// Those of candle.
+/// Those of candle; `horizon.length` must be at least 2.
 pub fn imagine(
     agent: &Agent,
     start: &State,
     horizon: &Horizon,
     sampler: &mut Sampler,
 ) -> Result<Imagination> {
-    let mut features = Vec::with_capacity(horizon.length);
-    let mut actions = Vec::with_capacity(horizon.length);
     let mut state = start.clone();
-    for step in 0..horizon.length {
-        let seen = state.features()?;
-        let action = agent.actor.forward(&seen.detach())?.sample(sampler)?;
-        if step + 1 < horizon.length {
-            state = agent.world.imagine_step(&state, &action, sampler)?;
-        }
-        features.push(seen);
+    let mut features = vec![state.features()?];
+    let mut actions = Vec::with_capacity(horizon.length);
+    let mut entropy = Vec::with_capacity(horizon.length);
+    for step in 1..horizon.length {
+        let policy = agent.actor.forward(&features[step - 1].detach())?;
+        let action = policy.sample(sampler)?;
+        state = agent.world.imagine_step(&state, &action, sampler)?;
+        features.push(state.features()?);
         actions.push(action);
+        entropy.push(policy.entropy()?.unsqueeze(1)?);
     }
     let features = Tensor::stack(&features, 0)?; // [L, N, state width]
     let reward = agent.heads.reward.mean(&agent.heads.reward.logits(&features)?)?;
@@ -55,6 +57,7 @@ pub fn imagine(
     Ok(Imagination {
         features,
         actions: Tensor::stack(&actions, 0)?,
+        entropy: Tensor::stack(&entropy, 0)?,
         reward,
         value,
         discount,

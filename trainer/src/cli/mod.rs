@@ -4,6 +4,7 @@ mod export;
 mod init;
 mod parameters;
 mod parity;
+mod pretrain;
 
 use std::path::Path;
 use std::process::ExitCode;
@@ -27,6 +28,7 @@ enum Verb {
     Parity(parity::Parity),
     Init(init::Init),
     Export(export::Export),
+    Pretrain(pretrain::Pretrain),
 }
 
 impl Arguments {
@@ -37,6 +39,7 @@ impl Arguments {
             Verb::Parity(verb) => verb.run(),
             Verb::Init(verb) => verb.run(),
             Verb::Export(verb) => verb.run(),
+            Verb::Pretrain(verb) => verb.run(),
         }
     }
 }
@@ -51,12 +54,31 @@ enum PresetName {
     Paper,
 }
 
+impl PresetName {
+    fn preset(self) -> Preset {
+        match self {
+            Self::Debug => Preset::Debug,
+            Self::Small => Preset::Small,
+            Self::Paper => Preset::Paper,
+        }
+    }
+}
+
 #[derive(Debug, Clone, Copy, ValueEnum)]
 enum ModelName {
     /// Robot and environment branch with interaction.
     Rcwm,
     /// One branch: the DreamerV3 baseline.
     Vanilla,
+}
+
+impl ModelName {
+    fn kind(self) -> ModelKind {
+        match self {
+            Self::Rcwm => ModelKind::Rcwm,
+            Self::Vanilla => ModelKind::Vanilla,
+        }
+    }
 }
 
 /// Which model, of which sizes.
@@ -76,16 +98,10 @@ struct ModelArguments {
 impl ModelArguments {
     /// The resolved sizes.
     fn settings(&self) -> Result<ModelSettings> {
-        let preset = match self.preset {
-            PresetName::Debug => Preset::Debug,
-            PresetName::Small => Preset::Small,
-            PresetName::Paper => Preset::Paper,
-        };
-        let kind = match self.model {
-            ModelName::Rcwm => ModelKind::Rcwm,
-            ModelName::Vanilla => ModelKind::Vanilla,
-        };
-        let resolved = settings::with_overrides(&ModelSettings::preset(preset, kind), &self.overrides)?;
+        let resolved = settings::with_overrides(
+            &ModelSettings::preset(self.preset.preset(), self.model.kind()),
+            &self.overrides,
+        )?;
         resolved.validate()?;
         Ok(resolved)
     }

@@ -2,7 +2,7 @@ use std::path::PathBuf;
 use std::process::ExitCode;
 
 use anyhow::Result;
-use rcwm_trainer::parity::{self, Group, Report};
+use rcwm_trainer::parity::{self, Group, Measure, Report};
 use serde::Serialize;
 
 /// Compare our model with a reference file of the authors' implementation; exit 1 beyond tolerance
@@ -45,15 +45,22 @@ impl Parity {
 }
 
 fn print(report: &Report) {
-    println!("{:<17} {:>7} {:>10} {:>10}         worst tensor", "group", "tensors", "max error", "tolerance");
+    println!(
+        "{:<17} {:>7} {:>10} {:>10}            worst tensor",
+        "group", "tensors", "max error", "tolerance"
+    );
     for group in &report.groups {
         let worst = group.worst();
         println!(
-            "{:<17} {:>7} {:>10.2e} {:>10.0e}  {:<5}  {}",
+            "{:<17} {:>7} {:>10.2e} {:>10.0e} {}  {:<5}  {}",
             group.group.as_str(),
             group.comparisons.len(),
             worst.map_or(f32::NAN, |worst| worst.error_max),
             group.tolerance,
+            match group.measure {
+                Measure::Absolute => "abs",
+                Measure::Relative => "rel",
+            },
             if group.passes() { "ok" } else { "FAIL" },
             worst.map_or("", |worst| worst.name.as_str()),
         );

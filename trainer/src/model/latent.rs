@@ -194,6 +194,14 @@ impl Sampler {
         Self::Seeded(Box::new(ChaCha8Rng::seed_from_u64(seed)))
     }
 
+    /// The sampler of one numbered step of training: seed and number say all, so there is no state to save.
+    #[must_use]
+    pub fn numbered(seed: u64, number: u64) -> Self {
+        let mut generator = ChaCha8Rng::seed_from_u64(seed);
+        generator.set_stream(number);
+        Self::Seeded(Box::new(generator))
+    }
+
     /// Standard Gumbel noise of this shape; none for the mode.
     ///
     /// # Errors

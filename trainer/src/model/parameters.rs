@@ -144,13 +144,19 @@ impl Parameters {
     /// A scope that gives the parameters themselves: gradients reach them.
     #[must_use]
     pub fn trainable(&self) -> Scope<'_> {
-        Scope { source: Source::Shared { parameters: self, frozen: false }, prefix: String::new() }
+        self.trainable_where(|_| true)
     }
 
     /// A scope that gives the same values, always current, without gradients.
     #[must_use]
     pub fn frozen(&self) -> Scope<'_> {
-        Scope { source: Source::Shared { parameters: self, frozen: true }, prefix: String::new() }
+        self.trainable_where(|_| false)
+    }
+
+    /// A scope in which gradients reach the parameters whose names `trains` accepts, and no others.
+    #[must_use]
+    pub fn trainable_where(&self, trains: fn(&str) -> bool) -> Scope<'_> {
+        Scope { source: Source::Shared { parameters: self, trains }, prefix: String::new() }
     }
 }
 
@@ -175,7 +181,7 @@ impl Recorder {
 #[derive(Debug, Clone, Copy)]
 enum Source<'a> {
     Recording(&'a RefCell<Vec<ParameterSpec>>),
-    Shared { parameters: &'a Parameters, frozen: bool },
+    Shared { parameters: &'a Parameters, trains: fn(&str) -> bool },
 }
 
 /// A place in the tree of names from which a part of a model takes its parameters.
@@ -203,7 +209,7 @@ impl Scope<'_> {
                 specs.borrow_mut().push(ParameterSpec { name, shape: shape.to_vec(), init });
                 Ok(Tensor::zeros((), DType::F32, &Device::Cpu)?.broadcast_as(shape)?)
             }
-            Source::Shared { parameters, frozen } => {
+            Source::Shared { parameters, trains } => {
                 let var = parameters
                     .get(&name)
                     .ok_or_else(|| ParameterError::Missing { name: name.clone(), shape: shape.to_vec() })?;
@@ -211,7 +217,7 @@ impl Scope<'_> {
                     let found = var.dims().to_vec();
                     return Err(ParameterError::Shape { name, found, expected: shape.to_vec() });
                 }
-                Ok(if frozen { var.as_detached_tensor() } else { var.as_tensor().clone() })
+                Ok(if trains(&name) { var.as_tensor().clone() } else { var.as_detached_tensor() })
             }
         }
     }

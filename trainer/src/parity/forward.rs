@@ -1,7 +1,8 @@
 use candle_core::{Device, Tensor};
 
-use super::{ParityError, Reference};
-use crate::behaviour::{self, Horizon};
+use super::{Group, ParityError, Reference};
+use crate::behaviour::{self, BehaviourSettings, ReturnRange};
+use crate::learning::Batch;
 use crate::model::agent::{self, Agent};
 use crate::model::latent::{FirstSteps, Sampler, State};
 use crate::model::parameters::Parameters;
@@ -11,62 +12,11 @@ use crate::model::world::Observed;
 /// Steps that are seen before the open loop begins.
 const CONTEXT: usize = 2;
 
-/// A group of reference tensors that we compute.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord, Hash, serde::Serialize, clap::ValueEnum)]
-#[serde(rename_all = "lowercase")]
-pub enum Group {
-    /// Embeddings of the images.
-    Encoder,
-    /// Priors, posteriors and the interaction over the batch.
-    Observe,
-    /// Pictures and masks of both branches.
-    Decode,
-    /// Reward and continuation.
-    Heads,
-    /// Action distribution.
-    Actor,
-    /// Value.
-    Critic,
-    /// Open loop with the recorded actions.
-    Imagine,
-    /// Imagination with the actor: states, actions, rewards, values, weights, returns.
-    Behaviour,
-}
-
-impl Group {
-    /// All groups, in the order of the data.
-    pub const ALL: [Self; 8] = [
-        Self::Encoder,
-        Self::Observe,
-        Self::Decode,
-        Self::Heads,
-        Self::Actor,
-        Self::Critic,
-        Self::Imagine,
-        Self::Behaviour,
-    ];
-
-    /// The first part of its tensors' names.
-    #[must_use]
-    pub const fn as_str(self) -> &'static str {
-        match self {
-            Self::Encoder => "encoder",
-            Self::Observe => "observe",
-            Self::Decode => "decode",
-            Self::Heads => "heads",
-            Self::Actor => "actor",
-            Self::Critic => "critic",
-            Self::Imagine => "imagine",
-            Self::Behaviour => "behaviour",
-        }
-    }
-}
-
 /// Named results.
-type Named = Vec<(String, Tensor)>;
+pub(super) type Named = Vec<(String, Tensor)>;
 
 /// Our forward values on a reference's weights and inputs; every draw is the mode, every action the mean, as in the reference.
-pub struct Forward<'a> {
+pub(super) struct Forward<'a> {
     reference: &'a Reference,
     agent: Agent,
     embeds: Vec<Tensor>,
@@ -76,13 +26,10 @@ pub struct Forward<'a> {
 
 impl<'a> Forward<'a> {
     pub fn new(reference: &'a Reference, device: &Device) -> Result<Self, ParityError> {
-        let specs = agent::specs(&reference.settings)?;
-        let parameters = Parameters::from_tensors(&specs, reference.weights(device)?, device)?;
+        let parameters = parameters(reference, device)?;
         let agent = Agent::new(&parameters.frozen(), &reference.settings)?;
-        let embeds = agent.world.encode(&reference.tensor("input/image", device)?)?;
-        let actions = reference.tensor("input/action", device)?;
-        let first = reference.tensor("input/is_first", device)?.flatten_all()?.to_vec1::<f32>()?;
-        let first = FirstSteps::new(first.into_iter().map(|flag| flag != 0.0).collect(), reference.length);
+        let Batch { image, action: actions, first, .. } = batch(reference, device)?;
+        let embeds = agent.world.encode(&image)?;
         let observed = agent.world.observe(&embeds, &actions, &first, &mut Sampler::Mode)?;
         Ok(Self { reference, agent, embeds, actions, observed })
     }
@@ -102,6 +49,7 @@ impl<'a> Forward<'a> {
             Group::Critic => vec![("value".to_owned(), self.value()?)],
             Group::Imagine => self.imagine()?,
             Group::Behaviour => self.behaviour()?,
+            _ => Vec::new(),
         };
         Ok(values.into_iter().map(|(name, value)| (format!("{prefix}/{name}"), value)).collect())
     }
@@ -157,19 +105,54 @@ impl<'a> Forward<'a> {
     }
 
     fn behaviour(&self) -> Result<Named, ParityError> {
+        let settings = behaviour_settings(self.reference);
         let start = self.observed.posteriors.map(|x| x.flatten(0, 1))?; // [B*T, ...]
-        let horizon = Horizon { length: self.reference.horizon, ..Horizon::default() };
-        let imagined = behaviour::imagine(&self.agent, &start, &horizon, &mut Sampler::Mode)?;
-        let before_last = horizon.length - 1;
+        let imagined = behaviour::imagine(&self.agent, &start, &settings.horizon, &mut Sampler::Mode)?;
+        let before_last = settings.horizon.length - 1;
+        // The file also holds the action that would be taken in the last state.
+        let last =
+            self.agent.actor.forward(&imagined.features.get(before_last)?)?.sample(&mut Sampler::Mode)?;
+        let mut range = ReturnRange::default();
+        range.update(&imagined.returns, &settings)?;
+        let range = Tensor::new(&[range.low as f32, range.high as f32], imagined.returns.device())?;
         Ok(vec![
             ("features".to_owned(), imagined.features),
-            ("actions".to_owned(), imagined.actions),
+            ("actions".to_owned(), Tensor::cat(&[&imagined.actions, &last.unsqueeze(0)?], 0)?),
             ("reward".to_owned(), imagined.reward),
             ("value".to_owned(), imagined.value.narrow(0, 0, before_last)?),
             ("weights".to_owned(), imagined.weights),
             ("lambda_return".to_owned(), imagined.returns.transpose(0, 1)?),
+            ("return_range".to_owned(), range),
         ])
     }
+}
+
+/// The file's weights.
+pub(super) fn parameters(reference: &Reference, device: &Device) -> Result<Parameters, ParityError> {
+    let specs = agent::specs(&reference.settings)?;
+    Ok(Parameters::from_tensors(&specs, reference.weights(device)?, device)?)
+}
+
+/// The file's inputs.
+pub(super) fn batch(reference: &Reference, device: &Device) -> Result<Batch, ParityError> {
+    let input = |name: &str| reference.tensor(&format!("input/{name}"), device);
+    let first = input("is_first")?.flatten_all()?.to_vec1::<f32>()?;
+    Ok(Batch {
+        image: input("image")?,
+        action: input("action")?,
+        reward: input("reward")?,
+        terminal: input("is_terminal")?,
+        first: FirstSteps::new(first.into_iter().map(|flag| flag != 0.0).collect(), reference.length),
+        robot_mask: Some(input("robot_mask")?),
+    })
+}
+
+/// The paper's settings with the file's horizon. In the file, the critic's gradients hold those of the actor's loss as well (a
+/// least-squares fit finds both with a factor of 1), against the definition: that is switched on here and nowhere else.
+pub(super) fn behaviour_settings(reference: &Reference) -> BehaviourSettings {
+    let mut settings = BehaviourSettings { actor_loss_reaches_critic: true, ..BehaviourSettings::default() };
+    settings.horizon.length = reference.horizon;
+    settings
 }
 
 /// `robot<suffix>/z`, `/h`, `/logits`, and the environment's.

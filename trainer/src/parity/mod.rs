@@ -4,21 +4,21 @@
 //! holds and nothing here computes is listed as not checked; it never counts as a pass.
 
 mod forward;
+mod group;
 mod reference;
 mod report;
+mod updates;
 
 use std::path::Path;
 
 use candle_core::Device;
 
-pub use forward::Group;
+pub use group::{Group, Measure};
 pub use reference::{Reference, ReferenceError};
 pub use report::{Comparison, GroupReport, Report, Unchecked};
 
+use crate::learning::LearningError;
 use crate::model::parameters::ParameterError;
-
-/// Forward values may differ by this much, absolute.
-pub const FORWARD_TOLERANCE: f32 = 1e-5;
 
 /// Why a file could not be compared.
 #[derive(Debug, thiserror::Error)]
@@ -29,6 +29,9 @@ pub enum ParityError {
     /// Its weights do not fit the model.
     #[error("reference weights: {0}")]
     Parameters(#[from] ParameterError),
+    /// An update could not be made.
+    #[error(transparent)]
+    Learning(#[from] LearningError),
     /// A tensor operation failed.
     #[error(transparent)]
     Tensor(#[from] candle_core::Error),
@@ -48,14 +51,21 @@ pub fn check_file(path: &Path, groups: &[Group], device: &Device) -> Result<Repo
 /// See [`ParityError`]; a difference is no error but part of the report.
 pub fn check(reference: &Reference, groups: &[Group], device: &Device) -> Result<Report, ParityError> {
     let mut forward = forward::Forward::new(reference, device)?;
+    let mut updates = None;
     let mut reports = Vec::new();
     for group in groups {
-        let comparisons = forward
-            .compute(*group)?
-            .into_iter()
-            .map(|(name, found)| Comparison::absolute(reference, &name, &found))
-            .collect::<Result<_, ParityError>>()?;
-        reports.push(GroupReport { group: *group, tolerance: FORWARD_TOLERANCE, comparisons });
+        let found = if *group <= Group::Behaviour {
+            forward.compute(*group)?
+        } else {
+            // Made once, and only if one of its groups is asked for.
+            let made = updates.take().map_or_else(|| updates::Updates::new(reference, device), Ok)?;
+            updates.insert(made).compute(*group)?
+        };
+        let (measure, tolerance) = group.tolerance();
+        let compare =
+            |(name, found): (String, candle_core::Tensor)| Comparison::new(reference, &name, &found, measure);
+        let comparisons = found.into_iter().map(compare).collect::<Result<_, ParityError>>()?;
+        reports.push(GroupReport { group: *group, measure, tolerance, comparisons });
     }
     Ok(Report::new(reference, reports))
 }

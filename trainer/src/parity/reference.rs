@@ -1,7 +1,7 @@
 use std::collections::{BTreeMap, HashMap};
 use std::path::Path;
 
-use candle_core::{Device, Tensor};
+use candle_core::{DType, Device, Tensor};
 use rcwm_models::files::{FileError, read_capped};
 use rcwm_models::settings::{ModelKind, ModelSettings, SettingsError};
 use rcwm_models::tensors::{Tensors, TensorsError, Values};
@@ -46,6 +46,8 @@ pub struct Reference {
     pub length: usize,
     /// L: states of an imagination, the start included.
     pub horizon: usize,
+    /// Factor of the reward's loss.
+    pub reward_scale: f64,
     /// All tensors by name.
     pub tensors: Tensors,
 }
@@ -111,7 +113,13 @@ impl Reference {
                 return Err(ReferenceError::Metadata { key, found, expected });
             }
         }
-        Ok(Self { settings, batch, length, horizon, tensors })
+        let text = metadata.get("reward_scale").map_or("nothing", String::as_str);
+        let reward_scale = text.parse().map_err(|_| ReferenceError::Metadata {
+            key: "reward_scale",
+            found: text.to_owned(),
+            expected: "a number".into(),
+        })?;
+        Ok(Self { settings, batch, length, horizon, reward_scale, tensors })
     }
 
     /// A tensor of the file.
@@ -121,6 +129,20 @@ impl Reference {
     pub fn tensor(&self, name: &str, device: &Device) -> Result<Tensor, super::ParityError> {
         let values = self.tensors.get(name).map_err(ReferenceError::from)?;
         Ok(to_tensor(values, device)?)
+    }
+
+    /// What errors of a tensor are measured against: its own largest magnitude. A softmax does not see what is added to all of its
+    /// inputs, so the gradient of the keys' bias is 0 and the file holds rounding: it is measured against the keys' weight.
+    ///
+    /// # Errors
+    /// [`TensorsError::Missing`] or candle's.
+    pub fn unit(&self, name: &str) -> Result<f32, super::ParityError> {
+        let name = match name {
+            "grad/interaction.key.bias" => "grad/interaction.key.weight",
+            _ => name,
+        };
+        let largest = self.tensor(name, &Device::Cpu)?.flatten_all()?.to_dtype(DType::F32)?.abs()?.max(0)?;
+        Ok(largest.to_scalar::<f32>()?.max(f32::MIN_POSITIVE))
     }
 
     /// The weights, by the parameters' names.

@@ -3,7 +3,7 @@ use std::collections::{BTreeMap, BTreeSet};
 use candle_core::{DType, Device, Tensor};
 use serde::Serialize;
 
-use super::{Group, ParityError, Reference};
+use super::{Group, Measure, ParityError, Reference};
 
 /// One tensor, ours against the reference's.
 #[derive(Debug, Clone, Serialize)]
@@ -12,15 +12,20 @@ pub struct Comparison {
     pub name: String,
     /// Numbers compared.
     pub values: usize,
-    /// Largest error; NaN if any of our numbers is NaN, infinite if the shapes differ.
+    /// Largest error, in the group's measure; NaN if any of our numbers is NaN, infinite if the shapes differ.
     pub error_max: f32,
     /// Largest magnitude in the reference.
     pub largest: f32,
 }
 
 impl Comparison {
-    /// The largest absolute difference between `found` and the reference tensor `name`.
-    pub(super) fn absolute(reference: &Reference, name: &str, found: &Tensor) -> Result<Self, ParityError> {
+    /// The largest difference between `found` and the reference tensor `name`.
+    pub(super) fn new(
+        reference: &Reference,
+        name: &str,
+        found: &Tensor,
+        measure: Measure,
+    ) -> Result<Self, ParityError> {
         let expected = reference.tensor(name, &Device::Cpu)?;
         if found.dims() != expected.dims() {
             return Ok(Self { name: name.to_owned(), values: 0, error_max: f32::INFINITY, largest: 0.0 });
@@ -32,12 +37,13 @@ impl Comparison {
             let error = (a - b).abs();
             if worst.is_nan() || error.is_nan() { f32::NAN } else { worst.max(error) }
         };
-        Ok(Self {
-            name: name.to_owned(),
-            values: expected.len(),
-            error_max: found.iter().zip(&expected).fold(0.0, error),
-            largest: expected.iter().fold(0.0, |largest, x| largest.max(x.abs())),
-        })
+        let largest = expected.iter().fold(0f32, |largest, x| largest.max(x.abs()));
+        let unit = match measure {
+            Measure::Absolute => 1.0,
+            Measure::Relative => reference.unit(name)?,
+        };
+        let error_max = found.iter().zip(&expected).fold(0.0, error) / unit;
+        Ok(Self { name: name.to_owned(), values: expected.len(), error_max, largest })
     }
 }
 
@@ -46,6 +52,8 @@ impl Comparison {
 pub struct GroupReport {
     /// The group.
     pub group: Group,
+    /// How its errors are measured.
+    pub measure: Measure,
     /// Largest error accepted.
     pub tolerance: f32,
     /// Its tensors.

@@ -1,0 +1,182 @@
+use candle_core::Tensor;
+use rcwm_models::settings::ModelSettings;
+use serde::Serialize;
+
+use super::{BehaviourSettings, Imagination, ReturnRange, actor_loss, critic_loss, imagine};
+use crate::learning::{Adam, Gradients, LearningError, Trained};
+use crate::model::agent::Agent;
+use crate::model::latent::{Sampler, State};
+use crate::model::parameters::Parameters;
+
+/// Actor, critic and its slow copy with what it takes to train them. The world model is only read: no gradient reaches it.
+#[derive(Debug, Clone)]
+pub struct BehaviourLearner {
+    /// The actor trains; everything else is frozen (the critic too, unless the settings say otherwise).
+    acting: Agent,
+    /// The critic trains; everything else is frozen.
+    judging: Agent,
+    parameters: Parameters,
+    settings: BehaviourSettings,
+    actor_adam: Adam,
+    critic_adam: Adam,
+    return_range: ReturnRange,
+}
+
+/// Losses and gradients of one update, before it is made.
+#[derive(Debug, Clone)]
+pub struct BehaviourGradients {
+    /// Gradients of the actor's loss in the actor.
+    pub actor: Gradients,
+    /// Gradients of the critic's loss in the critic.
+    pub critic: Gradients,
+    /// The plain numbers.
+    pub values: BehaviourUpdate,
+}
+
+/// What one update of actor and critic was.
+#[derive(Debug, Clone, Copy, PartialEq, Serialize)]
+pub struct BehaviourUpdate {
+    /// The actor's loss.
+    pub actor_loss: f64,
+    /// The critic's loss.
+    pub critic_loss: f64,
+    /// Norm of the actor's gradients before clipping.
+    pub actor_gradient_norm: f64,
+    /// Norm of the critic's gradients before clipping.
+    pub critic_gradient_norm: f64,
+    /// Mean entropy of the actor, in nats.
+    pub entropy: f64,
+    /// Mean predicted reward.
+    pub reward: f64,
+    /// Mean lambda return.
+    pub lambda_return: f64,
+    /// Mean value.
+    pub value: f64,
+    /// What returns are divided by.
+    pub return_scale: f64,
+}
+
+impl BehaviourLearner {
+    /// A learner on `parameters`, which it shares.
+    ///
+    /// # Errors
+    /// If the parameters do not fit the model.
+    pub fn new(
+        parameters: &Parameters,
+        model: &ModelSettings,
+        settings: &BehaviourSettings,
+    ) -> Result<Self, LearningError> {
+        let agent = |trained: Trained| Agent::new(&parameters.trainable_where(trained.filter()), model);
+        let acting = if settings.actor_loss_reaches_critic { Trained::Behaviour } else { Trained::Actor };
+        Ok(Self {
+            acting: agent(acting)?,
+            judging: agent(Trained::Critic)?,
+            parameters: parameters.clone(),
+            settings: settings.clone(),
+            actor_adam: Adam::new(settings.actor.clone()),
+            critic_adam: Adam::new(settings.critic.clone()),
+            return_range: ReturnRange::default(),
+        })
+    }
+
+    /// One update from imaginations that start in every row of `start` [N, ...], which carries no gradient.
+    ///
+    /// # Errors
+    /// See [`LearningError`]; actor and critic are then as they were.
+    pub fn update(&mut self, start: &State, sampler: &mut Sampler) -> Result<BehaviourUpdate, LearningError> {
+        self.mix_slow_critic()?;
+        let imagined = self.imagine(start, sampler)?;
+        let gradients = self.gradients(&imagined)?;
+        self.apply(&gradients)?;
+        Ok(gradients.values)
+    }
+
+    /// Moves the slow critic towards the critic.
+    ///
+    /// # Errors
+    /// Those of candle.
+    pub fn mix_slow_critic(&self) -> candle_core::Result<()> {
+        let share = self.settings.slow_critic_share;
+        for (name, slow) in self.parameters.iter() {
+            let Some(name) = name.strip_prefix("slow_") else { continue };
+            let Some(critic) = self.parameters.get(name) else { continue };
+            let mixed = ((critic.as_tensor() * share)? + (slow.as_tensor() * (1.0 - share))?)?;
+            slow.set(&mixed.detach())?;
+        }
+        Ok(())
+    }
+
+    /// Imagines with the actor, keeping the graph.
+    ///
+    /// # Errors
+    /// Those of candle.
+    pub fn imagine(&self, start: &State, sampler: &mut Sampler) -> candle_core::Result<Imagination> {
+        imagine(&self.acting, start, &self.settings.horizon, sampler)
+    }
+
+    /// Takes the returns into the range, then gives losses and gradients of actor and critic.
+    ///
+    /// # Errors
+    /// See [`LearningError`].
+    pub fn gradients(&mut self, imagined: &Imagination) -> Result<BehaviourGradients, LearningError> {
+        let mut range = self.return_range;
+        range.update(&imagined.returns, &self.settings)?;
+        let actor_loss = actor_loss(imagined, range.scale(), self.settings.entropy_scale)?;
+        let critic_loss = self.critic_loss(imagined)?;
+        let of = |loss: &Tensor, trained: Trained| Gradients::of(loss, &self.parameters, trained.filter());
+        let (actor, critic) = if self.settings.actor_loss_reaches_critic {
+            let both = of(&(&actor_loss + &critic_loss)?, Trained::Behaviour)?;
+            (both.part(Trained::Actor.filter())?, both.part(Trained::Critic.filter())?)
+        } else {
+            (of(&actor_loss, Trained::Actor)?, of(&critic_loss, Trained::Critic)?)
+        };
+        self.return_range = range;
+        let mean = |x: &Tensor| Ok::<_, candle_core::Error>(f64::from(x.mean_all()?.to_scalar::<f32>()?));
+        let values = BehaviourUpdate {
+            actor_loss: mean(&actor_loss)?,
+            critic_loss: mean(&critic_loss)?,
+            actor_gradient_norm: actor.norm(),
+            critic_gradient_norm: critic.norm(),
+            entropy: mean(&imagined.entropy)?,
+            reward: mean(&imagined.reward)?,
+            lambda_return: mean(&imagined.returns)?,
+            value: mean(&imagined.value)?,
+            return_scale: range.scale(),
+        };
+        Ok(BehaviourGradients { actor, critic, values })
+    }
+
+    /// The critic's loss, in which the critic alone trains.
+    ///
+    /// # Errors
+    /// Those of candle.
+    pub fn critic_loss(&self, imagined: &Imagination) -> candle_core::Result<Tensor> {
+        critic_loss(&self.judging.critic, &self.judging.slow_critic, imagined)
+    }
+
+    /// Moves actor and critic.
+    ///
+    /// # Errors
+    /// Those of candle.
+    pub fn apply(&mut self, gradients: &BehaviourGradients) -> candle_core::Result<()> {
+        self.actor_adam.step(&self.parameters, &gradients.actor)?;
+        self.critic_adam.step(&self.parameters, &gradients.critic)
+    }
+
+    /// The average range of the returns.
+    #[must_use]
+    pub fn return_range(&self) -> ReturnRange {
+        self.return_range
+    }
+
+    /// The optimisers of actor and critic.
+    #[must_use]
+    pub fn adams(&self) -> [&Adam; 2] {
+        [&self.actor_adam, &self.critic_adam]
+    }
+
+    /// Goes on from an earlier run's optimisers and range.
+    pub fn resume(&mut self, actor: Adam, critic: Adam, range: ReturnRange) {
+        (self.actor_adam, self.critic_adam, self.return_range) = (actor, critic, range);
+    }
+}

@@ -1,0 +1,168 @@
+use std::path::{Path, PathBuf};
+use std::process::ExitCode;
+use std::sync::Arc;
+use std::sync::atomic::{AtomicBool, Ordering};
+
+use anyhow::{Context, Result};
+use indicatif::{ProgressBar, ProgressStyle};
+use rcwm_models::settings;
+use rcwm_trainer::replay::{Folder, Replay};
+use rcwm_trainer::training::{Metrics, Pretraining, Progress, Run, TrainingError, TrainingSettings};
+
+/// Train a world model on recorded episodes: mask warm-up, then mask-free
+#[derive(Debug, clap::Args)]
+#[command(after_help = "Examples:
+  rcwm-trainer pretrain --preset small --data data/upstream --out runs/small
+  rcwm-trainer pretrain --preset small --model vanilla --data data/upstream --out runs/vanilla --set replay.batch=4
+  rcwm-trainer pretrain --out runs/small --resume --set pretrain.updates=40000
+
+Every setting and its value is in settings.toml of the run's folder. RAYON_NUM_THREADS sets the number of threads; with the same
+number a resumed run gives the same weights, bit for bit, as one that was never interrupted.")]
+pub struct Pretrain {
+    /// Sizes to start from
+    #[arg(long, value_enum, default_value = "small", conflicts_with = "resume")]
+    preset: super::PresetName,
+    /// Which world model
+    #[arg(long, value_enum, default_value = "rcwm", conflicts_with = "resume")]
+    model: super::ModelName,
+    /// Folder of episodes, one sub-folder a task
+    #[arg(long, value_name = "DIR", required_unless_present = "resume")]
+    data: Option<PathBuf>,
+    /// Folder of masks as pictures, task/episode/*.png, in place of the episodes' own
+    #[arg(long, value_name = "DIR")]
+    masks: Option<PathBuf>,
+    /// Folder of the run
+    #[arg(long, value_name = "DIR")]
+    out: PathBuf,
+    /// Change one setting, for example --set replay.batch=4 (repeatable)
+    #[arg(long = "set", value_name = "KEY=VALUE")]
+    overrides: Vec<String>,
+    /// Go on with the run in --out from its newest checkpoint
+    #[arg(long)]
+    resume: bool,
+    /// Where to compute: cpu, cuda or cuda:N
+    #[arg(long, default_value = "cpu")]
+    device: String,
+}
+
+impl Pretrain {
+    pub fn run(self) -> Result<ExitCode> {
+        let device = super::parse_device(&self.device)?;
+        let stop = stop_on_ctrl_c()?;
+        let settings = self.settings()?;
+        settings.validate()?;
+        if !self.resume && self.out.join("settings.toml").exists() {
+            return Err(TrainingError::Exists { path: self.out }.into());
+        }
+        let replay = load(&settings)?;
+        let mut training = if self.resume {
+            Pretraining::resume(&self.out, settings.clone(), &device)?
+        } else {
+            Pretraining::create(&self.out, settings.clone(), &device)?
+        };
+        let bar = progress_bar(&settings, training.updates());
+        let outcome = training.run(replay, &stop, |progress| show(&bar, progress))?;
+        bar.finish_and_clear();
+        let out = self.out.display();
+        if outcome.interrupted {
+            println!("stopped and saved after {} updates; go on with --resume --out {out}", outcome.updates);
+        } else {
+            println!("{} updates; checkpoint in {}", outcome.updates, Run::last(&self.out).display());
+        }
+        Ok(ExitCode::SUCCESS)
+    }
+
+    /// The settings of a new run, or those of the run to be resumed; with the overrides.
+    fn settings(&self) -> Result<TrainingSettings> {
+        let mut settings = if self.resume {
+            Run::settings(&self.out)?
+        } else {
+            let data = self.data.clone().unwrap_or_default();
+            TrainingSettings::preset(self.preset.preset(), self.model.kind(), absolute(&data)?)
+        };
+        if let (true, Some(data)) = (self.resume, &self.data) {
+            settings.data = absolute(data)?;
+        }
+        if let Some(masks) = &self.masks {
+            settings.masks = absolute(masks)?;
+        }
+        let mut resolved = settings::with_overrides(&settings, &self.overrides)?;
+        if resolved.model != settings.model {
+            resolved.preset = "custom".to_owned();
+        }
+        Ok(resolved)
+    }
+}
+
+/// A run may be resumed from another folder.
+fn absolute(path: &Path) -> Result<PathBuf> {
+    std::path::absolute(path).with_context(|| format!("{}", path.display()))
+}
+
+fn stop_on_ctrl_c() -> Result<Arc<AtomicBool>> {
+    let stop = Arc::new(AtomicBool::new(false));
+    let heard = Arc::clone(&stop);
+    ctrlc::set_handler(move || {
+        // The second one no longer waits for the checkpoint.
+        if heard.swap(true, Ordering::Relaxed) {
+            std::process::exit(130);
+        }
+    })
+    .context("Ctrl-C could not be caught")?;
+    Ok(stop)
+}
+
+fn load(settings: &TrainingSettings) -> Result<Replay> {
+    let masks = Some(settings.masks.as_path()).filter(|path| !path.as_os_str().is_empty());
+    let folder = Folder::list(&settings.data, masks)?;
+    let bar = ProgressBar::new(folder.len() as u64)
+        .with_style(ProgressStyle::with_template("loading {wide_bar} {pos}/{len} episodes")?);
+    let replay = folder.load(settings.replay.capacity_steps, || bar.inc(1))?;
+    bar.finish_and_clear();
+    let masked = replay.masked();
+    println!(
+        "{} episodes, {} steps of {} tasks; with masks {} episodes, {} steps",
+        replay.episodes(),
+        replay.steps(),
+        replay.tasks().count(),
+        masked.episodes(),
+        masked.steps()
+    );
+    Ok(replay)
+}
+
+fn progress_bar(settings: &TrainingSettings, done: u64) -> ProgressBar {
+    let bar = ProgressBar::new(settings.pretrain.updates);
+    if let Ok(style) = ProgressStyle::with_template("{wide_bar} {pos}/{len} ETA {eta}\n{msg}") {
+        bar.set_style(style);
+    }
+    bar.set_position(done);
+    bar.reset_eta();
+    bar
+}
+
+fn show(bar: &ProgressBar, progress: &Progress<'_>) {
+    bar.set_position(progress.updates);
+    if let Some(metrics) = progress.metrics {
+        bar.set_message(describe(metrics));
+    }
+}
+
+fn describe(metrics: &Metrics) -> String {
+    let losses = &metrics.losses;
+    let optional = |name: &str, value: Option<f64>| {
+        value.map_or_else(String::new, |value| format!(" {name} {value:.1}"))
+    };
+    format!(
+        "{} {:.2} updates/s, waiting {:.0}%  total {:.1} image {:.1}{} reward {:.3} kl {:.2}{}",
+        metrics.phase,
+        metrics.updates_per_second,
+        100.0 * metrics.waiting_share,
+        losses.total,
+        losses.image,
+        optional("mask", losses.robot_mask),
+        losses.reward,
+        losses.robot_kl,
+        losses.environment_kl.map_or_else(String::new, |kl| format!(" + {kl:.2}")),
+    )
+}

@@ -1,0 +1,62 @@
+use candle_core::{Device, Result, Tensor};
+use rcwm_models::{ACTION_LEN, IMAGE_CHANNELS, IMAGE_SIDE};
+
+use crate::model::latent::FirstSteps;
+
+/// Sequences of experience as tensors.
+#[derive(Debug, Clone)]
+pub struct Batch {
+    /// u8 [B, T, 64, 64, 3].
+    pub image: Tensor,
+    /// The action that led to the image: [B, T, action].
+    pub action: Tensor,
+    /// [B, T].
+    pub reward: Tensor,
+    /// 1 where the episode truly ended, else 0: [B, T].
+    pub terminal: Tensor,
+    /// Where episodes begin.
+    pub first: FirstSteps,
+    /// 1 where the robot is, else 0: u8 or f32 [B, T, 64, 64, 1]; none when masks are not used.
+    pub robot_mask: Option<Tensor>,
+}
+
+/// The same on the host, as replay makes it; rows first, then steps.
+#[derive(Debug, Clone, PartialEq, Default)]
+pub struct HostBatch {
+    /// B.
+    pub rows: usize,
+    /// T.
+    pub length: usize,
+    /// B * T images.
+    pub image: Vec<u8>,
+    /// B * T actions.
+    pub action: Vec<f32>,
+    /// B * T rewards.
+    pub reward: Vec<f32>,
+    /// B * T flags.
+    pub terminal: Vec<bool>,
+    /// B * T flags.
+    pub first: Vec<bool>,
+    /// B * T masks, 1 where the robot is; empty when masks are not used.
+    pub robot_mask: Vec<u8>,
+}
+
+impl HostBatch {
+    /// The batch as tensors on `device`.
+    ///
+    /// # Errors
+    /// Those of candle, also if a field has the wrong length.
+    pub fn into_tensors(self, device: &Device) -> Result<Batch> {
+        let (b, t) = (self.rows, self.length);
+        let terminal: Vec<f32> = self.terminal.iter().map(|flag| f32::from(u8::from(*flag))).collect();
+        let mask = |mask| Tensor::from_vec(mask, (b, t, IMAGE_SIDE, IMAGE_SIDE, 1), device);
+        Ok(Batch {
+            image: Tensor::from_vec(self.image, (b, t, IMAGE_SIDE, IMAGE_SIDE, IMAGE_CHANNELS), device)?,
+            action: Tensor::from_vec(self.action, (b, t, ACTION_LEN), device)?,
+            reward: Tensor::from_vec(self.reward, (b, t), device)?,
+            terminal: Tensor::from_vec(terminal, (b, t), device)?,
+            first: FirstSteps::new(self.first, t),
+            robot_mask: if self.robot_mask.is_empty() { None } else { Some(mask(self.robot_mask)?) },
+        })
+    }
+}

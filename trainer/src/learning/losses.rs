@@ -1,0 +1,152 @@
+use candle_core::{DType, Result, Tensor};
+use serde::Serialize;
+
+use super::{Batch, BranchKl, WorldSettings, balanced_kl, cross_entropy, two_hot};
+use crate::model::agent::Agent;
+use crate::model::encoder::image_to_float;
+use crate::model::latent::Sampler;
+use crate::model::world::Observed;
+
+/// The terms of the world model's loss, each a scalar before its factor, and what they came from.
+#[derive(Debug, Clone)]
+pub struct WorldLosses {
+    /// Squared error of the picture, summed over pixels.
+    pub image: Tensor,
+    /// The same of the robot's mask; none when masks are not used.
+    pub robot_mask: Option<Tensor>,
+    /// Cross-entropy of the reward.
+    pub reward: Tensor,
+    /// Cross-entropy of the continuation.
+    pub continues: Tensor,
+    /// Each branch's KL, the robot's first.
+    pub branches: Vec<BranchKl>,
+    /// The sum with factors, which is differentiated.
+    pub total: Tensor,
+    /// The filtered batch.
+    pub observed: Observed,
+}
+
+/// The losses of a batch as plain numbers, for metrics.
+#[derive(Debug, Clone, Copy, PartialEq, Default, Serialize)]
+pub struct LossValues {
+    /// See [`WorldLosses`].
+    pub total: f64,
+    /// See [`WorldLosses`].
+    pub image: f64,
+    /// See [`WorldLosses`].
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub robot_mask: Option<f64>,
+    /// See [`WorldLosses`].
+    pub reward: f64,
+    /// See [`WorldLosses`].
+    #[serde(rename = "continue")]
+    pub continues: f64,
+    /// KL of the robot's branch (vanilla: of the only one), before it is clipped.
+    pub robot_kl: f64,
+    /// KL of the environment's branch.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub environment_kl: Option<f64>,
+}
+
+/// The world model's losses of a batch (eq. 2, 3, 9).
+///
+/// # Errors
+/// Those of candle.
+pub fn world_losses(
+    agent: &Agent,
+    batch: &Batch,
+    settings: &WorldSettings,
+    sampler: &mut Sampler,
+) -> Result<WorldLosses> {
+    let embeds = agent.world.encode(&batch.image)?;
+    let observed = agent.world.observe(&embeds, &batch.action, &batch.first, sampler)?;
+    let decoded = agent.world.decode(&observed.posteriors)?;
+    let features = observed.posteriors.features()?; // [B, T, state width]
+
+    let image = pixel_loss(&decoded.image, &image_to_float(&batch.image)?)?;
+    // The first picture is the robot's, and of the baseline the only one.
+    let robot_mask = match &batch.robot_mask {
+        Some(mask) => Some(pixel_loss(&decoded.pictures[0].mask, &mask.to_dtype(DType::F32)?)?),
+        None => None,
+    };
+    let reward = agent.heads.reward.logits(&features)?; // [B, T, bins]
+    let target = two_hot(&batch.reward.unsqueeze(2)?, reward.dim(2)?)?;
+    let reward = cross_entropy(&reward, &target)?.mean_all()?;
+    let continues = continue_loss(&agent.heads.continue_logit(&features)?, &batch.terminal)?;
+    let branches = observed
+        .posteriors
+        .branches
+        .iter()
+        .zip(&observed.priors.branches)
+        .map(|(q, p)| balanced_kl(q, p, agent.settings.unimix, settings.free_nats))
+        .collect::<Result<Vec<_>>>()?;
+
+    let mut total = ((&image * settings.image_scale)? + (&reward * settings.reward_scale)?)?;
+    total = (total + (&continues * settings.continue_scale)?)?;
+    if let Some(mask) = &robot_mask {
+        total = (total + (mask * settings.mask_scale)?)?;
+    }
+    for branch in &branches {
+        total = (total + (branch.dynamics.mean_all()? * settings.dynamics_scale)?)?;
+        total = (total + (branch.representation.mean_all()? * settings.representation_scale)?)?;
+    }
+    Ok(WorldLosses { image, robot_mask, reward, continues, branches, total, observed })
+}
+
+/// Squared error of [B, T, H, W, C], summed over pixels, then the mean: a scalar.
+fn pixel_loss(found: &Tensor, target: &Tensor) -> Result<Tensor> {
+    (found - target)?.sqr()?.flatten_from(2)?.sum(2)?.mean_all()
+}
+
+/// Binary cross-entropy of the logits [B, T, 1] against going on, where not `terminal` [B, T]: a scalar. As a softmax over the
+/// logits 0 and l it is stable for every l.
+fn continue_loss(logit: &Tensor, terminal: &Tensor) -> Result<Tensor> {
+    let logits = Tensor::cat(&[&logit.zeros_like()?, logit], 2)?; // [B, T, 2]: ends, goes on
+    let target = Tensor::stack(&[terminal, &terminal.affine(-1.0, 1.0)?], 2)?;
+    cross_entropy(&logits, &target)?.mean_all()
+}
+
+impl WorldLosses {
+    /// The plain numbers.
+    ///
+    /// # Errors
+    /// Those of candle.
+    pub fn values(&self) -> Result<LossValues> {
+        let scalar = |x: &Tensor| Ok::<_, candle_core::Error>(f64::from(x.to_scalar::<f32>()?));
+        let kl =
+            |index: usize| self.branches.get(index).map(|branch| scalar(&branch.kl.mean_all()?)).transpose();
+        Ok(LossValues {
+            total: scalar(&self.total)?,
+            image: scalar(&self.image)?,
+            robot_mask: self.robot_mask.as_ref().map(scalar).transpose()?,
+            reward: scalar(&self.reward)?,
+            continues: scalar(&self.continues)?,
+            robot_kl: kl(0)?.unwrap_or_default(),
+            environment_kl: kl(1)?,
+        })
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use candle_core::{Device, Var};
+
+    #[test]
+    fn the_continuation_loss_is_finite_and_right_for_every_logit() {
+        let device = Device::Cpu;
+        let values = [-200f32, -1.0, 0.0, 1.0, 200.0];
+        for (ends, sign) in [(0f32, -1.0), (1.0, 1.0)] {
+            for value in values {
+                let logit = Var::from_vec(vec![value], (1, 1, 1), &device).unwrap();
+                let loss = continue_loss(&logit, &Tensor::new(&[[ends]], &device).unwrap()).unwrap();
+                let grads = loss.backward().unwrap();
+                let slope = grads.get(&logit).unwrap().flatten_all().unwrap().to_vec1::<f32>().unwrap()[0];
+                let x = sign * f64::from(value);
+                let expected = if x > 50.0 { x } else { x.exp().ln_1p() };
+                assert!((f64::from(loss.to_scalar::<f32>().unwrap()) - expected).abs() < 1e-6, "{value}");
+                assert!((f64::from(slope) - sign / (1.0 + (-x).exp())).abs() < 1e-6, "{value} {slope}");
+            }
+        }
+    }
+}

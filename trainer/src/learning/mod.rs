@@ -1,0 +1,61 @@
+//! Learning the world model: what a batch is, what is wrong with it (losses), and how the parameters follow.
+//!
+//! | file | holds |
+//! | --- | --- |
+//! | `settings` | everything that can be chosen, with the paper's values |
+//! | `batch` | sequences of experience as tensors |
+//! | `losses` | image, mask, reward, continuation, KL per branch (spec: losses; eq. 2, 3, 9) |
+//! | `two_hot`, `kl` | cross-entropy over bins, balanced KL with free bits |
+//! | `gradients`, `adam` | gradients by name, clipping, the optimiser |
+//! | `sides` | which parameters belong to the robot's side, the environment's, the behaviour |
+//! | `world` | one update of the world model |
+
+mod adam;
+mod batch;
+mod gradients;
+mod kl;
+mod losses;
+mod settings;
+mod sides;
+mod two_hot;
+mod world;
+
+pub use adam::{Adam, AdamSettings, Moments};
+pub use batch::{Batch, HostBatch};
+pub use gradients::Gradients;
+pub use kl::{BranchKl, balanced_kl};
+pub use losses::{LossValues, WorldLosses, world_losses};
+pub use settings::WorldSettings;
+pub use sides::{Side, Trained, side_of};
+pub use two_hot::{cross_entropy, two_hot};
+pub use world::{WorldLearner, WorldUpdate};
+
+use crate::model::parameters::ParameterError;
+
+/// Why an update could not be made.
+#[derive(Debug, thiserror::Error)]
+pub enum LearningError {
+    /// A tensor operation failed.
+    #[error(transparent)]
+    Tensor(#[from] candle_core::Error),
+    /// The model could not be built on the parameters.
+    #[error(transparent)]
+    Parameters(#[from] ParameterError),
+    /// A parameter that is to be trained is not connected with the loss.
+    #[error("no gradient reaches parameter {name}, which is to be trained: an operation on its way has none")]
+    NoGradient {
+        /// The parameter.
+        name: String,
+    },
+    /// A loss or a gradient is NaN or infinite; the parameters were left as they were.
+    #[error(
+        "{what} is {value}: the update was not made; resume from the last checkpoint, with a lower learning rate if it \
+         happens again"
+    )]
+    NotFinite {
+        /// Which number.
+        what: &'static str,
+        /// Its value.
+        value: f64,
+    },
+}

@@ -1,0 +1,366 @@
+use std::collections::{BTreeMap, VecDeque};
+use std::sync::Arc;
+
+use ndarray::Axis;
+use rand::{Rng, SeedableRng};
+use rand_chacha::ChaCha8Rng;
+use rcwm_models::episode::Episode;
+
+use crate::learning::HostBatch;
+
+/// Why an episode was refused or a batch could not be drawn.
+#[derive(Debug, thiserror::Error)]
+pub enum ReplayError {
+    /// It holds no steps.
+    #[error("an episode of {task} holds no steps")]
+    Empty {
+        /// The task.
+        task: String,
+    },
+    /// An action or a reward is NaN or infinite.
+    #[error("an episode of {task} holds a {what} at step {step} that is not finite; leave the episode out")]
+    NotFinite {
+        /// The task.
+        task: String,
+        /// What it is.
+        what: &'static str,
+        /// Where.
+        step: usize,
+    },
+    /// It does not fit.
+    #[error(
+        "an episode of {task} has {steps} steps, the replay holds at most {capacity}; set replay.capacity_steps higher"
+    )]
+    TooLong {
+        /// The task.
+        task: String,
+        /// Its steps.
+        steps: usize,
+        /// The replay's capacity in steps.
+        capacity: usize,
+    },
+    /// There is nothing to draw from.
+    #[error("the replay holds no {}; collect some first", if *masks { "episode with robot masks" } else { "episode" })]
+    NothingToDraw {
+        /// Whether masks were asked for.
+        masks: bool,
+    },
+    /// Masks are asked for and an episode in the sequence has none.
+    #[error("an episode of {task} has no robot masks; draw from the masked episodes only")]
+    NoMasks {
+        /// The task.
+        task: String,
+    },
+}
+
+/// An episode and when it came.
+#[derive(Debug, Clone)]
+struct Stored {
+    episode: Arc<Episode>,
+    number: u64,
+}
+
+/// One task's episodes, oldest first.
+#[derive(Debug, Clone, Default)]
+struct Task {
+    episodes: VecDeque<Stored>,
+    steps: usize,
+}
+
+/// Episodes by task, up to a number of steps; the oldest go first.
+#[derive(Debug, Clone)]
+pub struct Replay {
+    tasks: BTreeMap<String, Task>,
+    capacity: usize,
+    steps: usize,
+    next_number: u64,
+}
+
+impl Replay {
+    /// An empty replay that holds at most `capacity` steps.
+    #[must_use]
+    pub fn new(capacity: usize) -> Self {
+        Self { tasks: BTreeMap::new(), capacity, steps: 0, next_number: 0 }
+    }
+
+    /// Steps held.
+    #[must_use]
+    pub fn steps(&self) -> usize {
+        self.steps
+    }
+
+    /// Episodes held.
+    #[must_use]
+    pub fn episodes(&self) -> usize {
+        self.tasks.values().map(|task| task.episodes.len()).sum()
+    }
+
+    /// The tasks with their episodes, oldest first.
+    pub fn tasks(&self) -> impl Iterator<Item = (&str, Vec<&Arc<Episode>>)> {
+        self.tasks
+            .iter()
+            .map(|(name, task)| (name.as_str(), task.episodes.iter().map(|stored| &stored.episode).collect()))
+    }
+
+    /// Adds an episode; where there is no room, the oldest episodes of the task with the most steps leave.
+    ///
+    /// # Errors
+    /// See [`ReplayError`]; nothing is changed then.
+    pub fn add(&mut self, task: &str, episode: impl Into<Arc<Episode>>) -> Result<(), ReplayError> {
+        let episode = episode.into();
+        check(task, &episode)?;
+        let steps = episode.len();
+        if steps > self.capacity {
+            return Err(ReplayError::TooLong { task: task.to_owned(), steps, capacity: self.capacity });
+        }
+        while self.steps + steps > self.capacity {
+            self.drop_oldest();
+        }
+        let number = self.next_number;
+        self.next_number += 1;
+        let home = self.tasks.entry(task.to_owned()).or_default();
+        home.episodes.push_back(Stored { episode, number });
+        home.steps += steps;
+        self.steps += steps;
+        Ok(())
+    }
+
+    fn drop_oldest(&mut self) {
+        let age = |task: &Task| task.episodes.front().map_or(u64::MAX, |stored| stored.number);
+        // Of tasks equally full, the one whose oldest episode is older gives way.
+        let fullest = self.tasks.values_mut().max_by_key(|task| (task.steps, std::cmp::Reverse(age(task))));
+        if let Some(task) = fullest
+            && let Some(oldest) = task.episodes.pop_front()
+        {
+            task.steps -= oldest.episode.len();
+            self.steps -= oldest.episode.len();
+        }
+        self.tasks.retain(|_, task| !task.episodes.is_empty());
+    }
+
+    /// The episodes that have robot masks; they share their memory with this replay's.
+    #[must_use]
+    pub fn masked(&self) -> Self {
+        let mut masked = Self::new(self.capacity);
+        masked.next_number = self.next_number;
+        for (name, task) in &self.tasks {
+            let with_mask = |stored: &&Stored| stored.episode.robot_mask.is_some();
+            let episodes: VecDeque<_> = task.episodes.iter().filter(with_mask).cloned().collect();
+            if !episodes.is_empty() {
+                let steps = episodes.iter().map(|stored| stored.episode.len()).sum();
+                masked.tasks.insert(name.clone(), Task { episodes, steps });
+                masked.steps += steps;
+            }
+        }
+        masked
+    }
+
+    /// Draws batch `number` of a seed: `rows` sequences of `length` steps.
+    ///
+    /// # Errors
+    /// [`ReplayError::NothingToDraw`] or [`ReplayError::NoMasks`].
+    pub fn draw(
+        &self,
+        rows: usize,
+        length: usize,
+        masks: bool,
+        seed: u64,
+        number: u64,
+    ) -> Result<HostBatch, ReplayError> {
+        if self.tasks.is_empty() {
+            return Err(ReplayError::NothingToDraw { masks });
+        }
+        let mut generator = ChaCha8Rng::seed_from_u64(seed);
+        generator.set_stream(number);
+        let mut batch = HostBatch { rows, length, ..HostBatch::default() };
+        let tasks: Vec<_> = self.tasks.iter().collect();
+        // The turn goes on from batch to batch, so that shares are equal also where they do not divide a batch.
+        let turn = (number % tasks.len() as u64) as usize * (rows % tasks.len());
+        for row in 0..rows {
+            let (name, task) = tasks[(turn + row) % tasks.len()];
+            task.append(name, generator.random_range(0..task.steps), length, masks, &mut batch)?;
+        }
+        Ok(batch)
+    }
+}
+
+impl Task {
+    /// Appends `length` steps that begin at step `start` of all this task's steps.
+    fn append(
+        &self,
+        name: &str,
+        start: usize,
+        length: usize,
+        masks: bool,
+        batch: &mut HostBatch,
+    ) -> Result<(), ReplayError> {
+        let (mut index, mut step) = (0, start);
+        while step >= self.episodes[index].episode.len() {
+            step -= self.episodes[index].episode.len();
+            index += 1;
+        }
+        let mut left = length;
+        while left > 0 {
+            let episode = &self.episodes[index].episode;
+            let count = left.min(episode.len() - step);
+            append_steps(name, episode, step, count, masks, batch)?;
+            left -= count;
+            step = 0;
+            index = (index + 1) % self.episodes.len();
+        }
+        Ok(())
+    }
+}
+
+fn append_steps(
+    name: &str,
+    episode: &Episode,
+    from: usize,
+    count: usize,
+    masks: bool,
+    batch: &mut HostBatch,
+) -> Result<(), ReplayError> {
+    let range = ndarray::Slice::from(from..from + count);
+    batch.image.extend(episode.image.slice_axis(Axis(0), range));
+    batch.action.extend(episode.action.slice_axis(Axis(0), range));
+    batch.reward.extend(episode.reward.slice_axis(Axis(0), range));
+    batch.terminal.extend(episode.is_terminal.slice_axis(Axis(0), range));
+    // What a file does not say of its first step is true all the same: nothing came before it.
+    batch.first.extend((from..from + count).map(|step| step == 0 || episode.is_first[step]));
+    if masks {
+        let mask = episode.robot_mask.as_ref();
+        let mask = mask.ok_or_else(|| ReplayError::NoMasks { task: name.to_owned() })?;
+        batch.robot_mask.extend(mask.slice_axis(Axis(0), range).iter().map(|robot| u8::from(*robot)));
+    }
+    Ok(())
+}
+
+fn check(task: &str, episode: &Episode) -> Result<(), ReplayError> {
+    if episode.is_empty() {
+        return Err(ReplayError::Empty { task: task.to_owned() });
+    }
+    let not_finite = |what, step| Err(ReplayError::NotFinite { task: task.to_owned(), what, step });
+    if let Some(step) = episode.reward.iter().position(|reward| !reward.is_finite()) {
+        return not_finite("reward", step);
+    }
+    let rows = episode.action.outer_iter();
+    if let Some(step) = rows.into_iter().position(|action| action.iter().any(|x| !x.is_finite())) {
+        return not_finite("action", step);
+    }
+    Ok(())
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use ndarray::{Array1, Array2, Array3, Array4};
+
+    /// An episode whose rewards are `from`, `from + 1`, ...
+    fn episode(from: usize, steps: usize, masked: bool) -> Episode {
+        let no = Array1::from_elem(steps, false);
+        let mut is_first = no.clone();
+        is_first[0] = true;
+        Episode {
+            image: Array4::from_shape_fn((steps, 64, 64, 3), |(t, ..)| (from + t) as u8),
+            action: Array2::zeros((steps, 4)),
+            reward: (0..steps).map(|t| (from + t) as f32).collect(),
+            is_first,
+            is_last: no.clone(),
+            is_terminal: no.clone(),
+            success: no,
+            robot_mask: masked.then(|| Array3::from_elem((steps, 64, 64), true)),
+            proprio: None,
+        }
+    }
+
+    #[test]
+    fn sequences_run_on_into_the_next_episode_and_say_so() {
+        let mut replay = Replay::new(100);
+        replay.add("reach", episode(0, 5, false)).unwrap();
+        replay.add("reach", episode(5, 3, false)).unwrap();
+        let mut starts = [0; 8];
+        for number in 0..400 {
+            let batch = replay.draw(2, 10, false, 7, number).unwrap();
+            for row in 0..2 {
+                let steps = &batch.reward[row * 10..][..10];
+                let start = steps[0] as usize;
+                starts[start] += 1;
+                for (offset, reward) in steps.iter().enumerate() {
+                    let step = (start + offset) % 8;
+                    assert_eq!(*reward, step as f32);
+                    assert_eq!(batch.first[row * 10 + offset], step == 0 || step == 5);
+                    assert_eq!(batch.image[(row * 10 + offset) * 64 * 64 * 3], step as u8);
+                }
+            }
+        }
+        assert!(starts.iter().all(|count| (60..140).contains(count)), "not uniform: {starts:?}");
+    }
+
+    #[test]
+    fn number_and_seed_decide_what_is_drawn() {
+        let mut replay = Replay::new(1000);
+        replay.add("reach", episode(0, 200, false)).unwrap();
+        let draw = |seed, number| replay.draw(4, 3, false, seed, number).unwrap();
+        assert_eq!(draw(1, 5), draw(1, 5));
+        assert_ne!(draw(1, 5).reward, draw(1, 6).reward);
+        assert_ne!(draw(1, 5).reward, draw(2, 5).reward);
+    }
+
+    #[test]
+    fn tasks_have_equal_shares_whatever_their_sizes() {
+        let mut replay = Replay::new(1000);
+        for (task, from, steps) in [("a", 0, 4), ("b", 50, 100), ("c", 200, 20)] {
+            replay.add(task, episode(from, steps, false)).unwrap();
+        }
+        let mut shares = [0; 3];
+        for number in 0..30 {
+            for reward in replay.draw(4, 1, false, 0, number).unwrap().reward {
+                shares[if reward < 50.0 {
+                    0
+                } else if reward < 200.0 {
+                    1
+                } else {
+                    2
+                }] += 1;
+            }
+        }
+        assert_eq!(shares, [40, 40, 40]);
+    }
+
+    #[test]
+    fn the_oldest_episodes_leave_when_it_is_full() {
+        let mut replay = Replay::new(10);
+        for from in [0, 4, 8] {
+            replay.add("reach", episode(from, 4, false)).unwrap();
+        }
+        assert_eq!((replay.steps(), replay.episodes()), (8, 2));
+        let rewards = replay.draw(8, 1, false, 0, 0).unwrap().reward;
+        assert!(rewards.iter().all(|reward| *reward >= 4.0));
+        assert!(matches!(replay.add("reach", episode(0, 11, false)), Err(ReplayError::TooLong { .. })));
+    }
+
+    #[test]
+    fn masks_come_only_from_episodes_that_have_them() {
+        let mut replay = Replay::new(100);
+        replay.add("reach", episode(0, 5, false)).unwrap();
+        assert!(matches!(
+            replay.masked().draw(1, 1, true, 0, 0),
+            Err(ReplayError::NothingToDraw { masks: true })
+        ));
+        replay.add("reach", episode(5, 5, true)).unwrap();
+        let batch = replay.masked().draw(3, 7, true, 0, 0).unwrap();
+        assert!(batch.reward.iter().all(|reward| *reward >= 5.0));
+        assert_eq!((batch.robot_mask.len(), batch.robot_mask[0]), (3 * 7 * 64 * 64, 1));
+        assert!(matches!(replay.draw(9, 9, true, 0, 0), Err(ReplayError::NoMasks { .. })));
+    }
+
+    #[test]
+    fn numbers_that_are_not_finite_are_refused() {
+        let mut replay = Replay::new(100);
+        let mut poisoned = episode(0, 5, false);
+        poisoned.reward[3] = f32::NAN;
+        let error = replay.add("reach", poisoned).unwrap_err();
+        assert!(error.to_string().contains("reward at step 3"), "{error}");
+        assert_eq!(replay.episodes(), 0);
+    }
+}

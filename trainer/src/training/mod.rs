@@ -1,0 +1,108 @@
+//! Training runs.
+//!
+//! A run is a folder:
+//!
+//! ```text
+//! settings.toml        everything that was chosen, resolved; --resume goes on from it
+//! metrics.jsonl        one line for every `metrics_every` updates: the truth
+//! checkpoints/last/    weights, settings and the optimiser's state; the newest
+//! films/               000500-reach.png: what the model imagines of one episode a task, with every checkpoint
+//! checkpoints/best/    the one with the lowest mask-free loss over an interval between checkpoints
+//! ```
+//!
+//! Every draw is numbered by its update, so the state of a run is: weights, moments of the optimiser, number of updates. A run
+//! that was interrupted and resumed gives the same weights, bit for bit, as one that was not, for a fixed number of threads.
+//!
+//! | file | holds |
+//! | --- | --- |
+//! | `settings` | what can be chosen, presets |
+//! | `state` | what a checkpoint holds beside the weights |
+//! | `run` | the folder: settings, metrics, checkpoints |
+//! | `film` | film strips of the open loop |
+//! | `pretrain` | the phase: mask warm-up, then mask-free updates |
+
+mod film;
+mod pretrain;
+mod run;
+mod settings;
+mod state;
+
+pub use film::{FilmSettings, film_strip, write_png};
+pub use pretrain::{Outcome, Pretraining, Progress};
+pub use run::{Metrics, Run};
+pub use settings::{PretrainSettings, ReplaySettings, TrainingSettings};
+pub use state::{StateError, TrainingState};
+
+use crate::checkpoint::CheckpointError;
+use crate::learning::LearningError;
+use crate::model::parameters::ParameterError;
+use crate::replay::{LoadError, PrefetchError, ReplayError};
+use rcwm_models::files::FileError;
+use rcwm_models::settings::SettingsError;
+use std::path::PathBuf;
+
+/// Why a run ended early.
+#[derive(Debug, thiserror::Error)]
+pub enum TrainingError {
+    /// The folder holds a run.
+    #[error("{path} holds a run already; say --resume, or choose another folder")]
+    Exists {
+        /// The folder.
+        path: PathBuf,
+    },
+    /// There is nothing to resume.
+    #[error("{path} holds no run to resume (no {file}); leave --resume out to start one")]
+    NothingToResume {
+        /// The folder.
+        path: PathBuf,
+        /// What is missing.
+        file: &'static str,
+    },
+    /// A resumed run would have another model.
+    #[error("the model's sizes differ from those of the run's checkpoint; a resumed run keeps its model")]
+    OtherModel,
+    /// The run's folder could not be read or written.
+    #[error("{path}: {source}")]
+    Folder {
+        /// What.
+        path: PathBuf,
+        /// What the operating system said.
+        source: std::io::Error,
+    },
+    /// A file could not be read or written.
+    #[error(transparent)]
+    File(#[from] FileError),
+    /// Settings are unusable.
+    #[error(transparent)]
+    Settings(#[from] SettingsError),
+    /// Settings could not be written.
+    #[error("settings: {0}")]
+    Serialize(#[from] toml::ser::Error),
+    /// Metrics could not be written.
+    #[error("metrics: {0}")]
+    Json(#[from] serde_json::Error),
+    /// The checkpoint is unusable or could not be written.
+    #[error(transparent)]
+    Checkpoint(#[from] CheckpointError),
+    /// The optimiser's state is unusable or could not be written.
+    #[error(transparent)]
+    State(#[from] StateError),
+    /// Parameters do not fit.
+    #[error(transparent)]
+    Parameters(#[from] ParameterError),
+    /// An update failed.
+    #[error(transparent)]
+    Learning(#[from] LearningError),
+    /// Data could not be loaded.
+    #[error(transparent)]
+    Load(#[from] LoadError),
+    /// Experience was refused or there is none.
+    #[error(transparent)]
+    Replay(#[from] ReplayError),
+    /// No batch came.
+    #[error(transparent)]
+    Prefetch(#[from] PrefetchError),
+    /// A tensor operation failed.
+    #[error(transparent)]
+    Tensor(#[from] candle_core::Error),
+}

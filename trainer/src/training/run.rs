@@ -1,0 +1,202 @@
+use std::fs::{self, File, OpenOptions};
+use std::io::Write;
+use std::path::{Path, PathBuf};
+
+use candle_core::Device;
+use rcwm_models::files::{read_capped, write_atomic};
+use serde::{Deserialize, Serialize};
+
+use super::{TrainingError, TrainingSettings, TrainingState};
+use crate::checkpoint::{self, Checkpoint, CheckpointSettings};
+use crate::learning::{Adam, LossValues};
+use crate::model::parameters::Parameters;
+
+const SETTINGS_FILE: &str = "settings.toml";
+const METRICS_FILE: &str = "metrics.jsonl";
+/// Largest file of metrics that is read back, in bytes.
+const METRICS_BYTES_MAX: u64 = 1 << 30;
+
+/// One line of metrics: means over the updates since the line before.
+#[derive(Debug, Clone, PartialEq, Serialize)]
+pub struct Metrics {
+    /// Updates made so far.
+    pub update: u64,
+    /// `warm_up` or `mask_free`.
+    pub phase: &'static str,
+    /// The losses before their factors.
+    pub losses: LossValues,
+    /// Norm of the gradients before clipping.
+    pub gradient_norm: f64,
+    /// Updates a second.
+    pub updates_per_second: f64,
+    /// Share of the time spent waiting for batches.
+    pub waiting_share: f64,
+}
+
+/// A run's folder.
+#[derive(Debug)]
+pub struct Run {
+    folder: PathBuf,
+    metrics: File,
+}
+
+impl Run {
+    /// Makes the folder of a new run.
+    ///
+    /// # Errors
+    /// [`TrainingError::Exists`] if there is a run already, or those of writing.
+    pub fn create(folder: &Path, settings: &TrainingSettings) -> Result<Self, TrainingError> {
+        if folder.join(SETTINGS_FILE).exists() {
+            return Err(TrainingError::Exists { path: folder.to_path_buf() });
+        }
+        fs::create_dir_all(folder).map_err(failed(folder))?;
+        write_atomic(&folder.join(METRICS_FILE), b"")?;
+        Self::open(folder, settings)
+    }
+
+    /// Goes on with a run: metrics beyond `updates` belong to updates that were lost, and are dropped.
+    ///
+    /// # Errors
+    /// Those of reading and writing.
+    pub fn resume(folder: &Path, settings: &TrainingSettings, updates: u64) -> Result<Self, TrainingError> {
+        #[derive(Deserialize)]
+        struct Line {
+            update: u64,
+        }
+        let path = folder.join(METRICS_FILE);
+        let text = read_capped(&path, METRICS_BYTES_MAX)?;
+        let mut kept = String::new();
+        for line in String::from_utf8_lossy(&text).lines() {
+            // A line that was cut off is of an update that was lost.
+            if serde_json::from_str::<Line>(line).is_ok_and(|line| line.update <= updates) {
+                kept.push_str(line);
+                kept.push('\n');
+            }
+        }
+        for place in [folder, &folder.join("checkpoints/last"), &folder.join("checkpoints/best")] {
+            remove_unfinished(place).map_err(failed(place))?;
+        }
+        write_atomic(&path, kept.as_bytes())?;
+        Self::open(folder, settings)
+    }
+
+    fn open(folder: &Path, settings: &TrainingSettings) -> Result<Self, TrainingError> {
+        write_atomic(&folder.join(SETTINGS_FILE), toml::to_string(settings)?.as_bytes())?;
+        let path = folder.join(METRICS_FILE);
+        let metrics = OpenOptions::new().append(true).open(&path).map_err(failed(&path))?;
+        Ok(Self { folder: folder.to_path_buf(), metrics })
+    }
+
+    /// The settings of the run in `folder`.
+    ///
+    /// # Errors
+    /// [`TrainingError::NothingToResume`] or those of reading.
+    pub fn settings(folder: &Path) -> Result<TrainingSettings, TrainingError> {
+        let path = folder.join(SETTINGS_FILE);
+        if !path.exists() {
+            return Err(TrainingError::NothingToResume { path: folder.to_path_buf(), file: SETTINGS_FILE });
+        }
+        Ok(rcwm_models::settings::read(&path)?)
+    }
+
+    /// The run's newest checkpoint.
+    #[must_use]
+    pub fn last(folder: &Path) -> PathBuf {
+        folder.join("checkpoints").join("last")
+    }
+
+    /// Whether the run in `folder` ever saved a checkpoint; one that died before starts from the beginning.
+    #[must_use]
+    pub fn has_checkpoint(folder: &Path) -> bool {
+        Self::last(folder).join(checkpoint::SETTINGS_FILE).exists()
+    }
+
+    /// Appends a line of metrics.
+    ///
+    /// # Errors
+    /// Those of writing.
+    pub fn log(&mut self, metrics: &Metrics) -> Result<(), TrainingError> {
+        let mut line = serde_json::to_vec(metrics)?;
+        line.push(b'\n');
+        self.metrics.write_all(&line).map_err(failed(&self.folder.join(METRICS_FILE)))
+    }
+
+    /// Where the film strip of a task at this update goes; the folder is made.
+    ///
+    /// # Errors
+    /// Those of making it.
+    pub fn film(&self, updates: u64, task: &str) -> Result<PathBuf, TrainingError> {
+        let films = self.folder.join("films");
+        fs::create_dir_all(&films).map_err(failed(&films))?;
+        Ok(films.join(format!("{updates:06}-{task}.png")))
+    }
+
+    /// Saves a checkpoint as the newest one, and as the best if it is. The state is written before the weights that it goes with,
+    /// and older states are removed after, so that the folder always holds a whole pair.
+    ///
+    /// # Errors
+    /// Those of writing.
+    pub fn save(
+        &self,
+        parameters: &Parameters,
+        settings: &TrainingSettings,
+        state: &TrainingState,
+        optimisers: &[(&str, &Adam)],
+        is_best: bool,
+    ) -> Result<(), TrainingError> {
+        let checkpoint = Checkpoint {
+            settings: CheckpointSettings {
+                format: checkpoint::FORMAT,
+                preset: settings.preset.clone(),
+                seed: settings.seed,
+                updates: state.updates,
+                data: settings.data.display().to_string(),
+                weights_sha256: String::new(),
+                model: settings.model.clone(),
+            },
+            parameters: parameters.clone(),
+        };
+        if is_best {
+            checkpoint.write(&self.folder.join("checkpoints").join("best"))?;
+        }
+        let last = Self::last(&self.folder);
+        fs::create_dir_all(&last).map_err(failed(&last))?;
+        let weights_sha256 = checkpoint.weights_sha256()?;
+        state.write(optimisers, &last, &weights_sha256)?;
+        checkpoint.write(&last)?;
+        Ok(TrainingState::remove_others(&last, &weights_sha256)?)
+    }
+
+    /// Reads the newest checkpoint with the state and the moments that go with it.
+    ///
+    /// # Errors
+    /// Those of reading.
+    pub fn load(
+        folder: &Path,
+        device: &Device,
+    ) -> Result<(Checkpoint, TrainingState, rcwm_models::tensors::Tensors), TrainingError> {
+        let last = Self::last(folder);
+        let checkpoint = Checkpoint::read(&last, device)?;
+        let (state, moments) = TrainingState::read(&last, &checkpoint.settings.weights_sha256)?;
+        Ok((checkpoint, state, moments))
+    }
+}
+
+/// Removes what a run that was killed had begun to write; such files never count, but take room.
+fn remove_unfinished(folder: &Path) -> std::io::Result<()> {
+    if !folder.is_dir() {
+        return Ok(());
+    }
+    for entry in fs::read_dir(folder)? {
+        let entry = entry?;
+        if entry.file_name().to_string_lossy().starts_with(".writing-") {
+            fs::remove_file(entry.path())?;
+        }
+    }
+    Ok(())
+}
+
+fn failed(path: &Path) -> impl FnOnce(std::io::Error) -> TrainingError {
+    let path = path.to_path_buf();
+    move |source| TrainingError::Folder { path, source }
+}

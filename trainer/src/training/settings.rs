@@ -1,0 +1,206 @@
+use std::path::PathBuf;
+
+use rcwm_models::settings::{ModelKind, ModelSettings, Preset, SettingsError};
+use serde::{Deserialize, Serialize};
+
+use super::FilmSettings;
+use crate::behaviour::BehaviourSettings;
+use crate::learning::WorldSettings;
+
+/// Everything that can be chosen for a run. The resolved settings are written into its folder.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct TrainingSettings {
+    /// Sizes the run started from: `debug`, `small`, `paper`, or `custom` where the model was changed.
+    pub preset: String,
+    /// Seed of everything that is drawn.
+    pub seed: u64,
+    /// Folder of the episodes, `task/*.npz`.
+    pub data: PathBuf,
+    /// Folder of masks as pictures, `task/episode/*.png`; empty where the episodes' own masks are used.
+    #[serde(default)]
+    pub masks: PathBuf,
+    /// Updates between two lines of metrics.
+    #[serde(default = "metrics_every")]
+    pub metrics_every: u64,
+    /// Updates between two checkpoints.
+    #[serde(default = "checkpoint_every")]
+    pub checkpoint_every: u64,
+    /// Sizes of the model.
+    pub model: ModelSettings,
+    /// Learning of the world model.
+    #[serde(default)]
+    pub world: WorldSettings,
+    /// Learning of actor and critic.
+    #[serde(default)]
+    pub behaviour: BehaviourSettings,
+    /// Experience and batches.
+    #[serde(default)]
+    pub replay: ReplaySettings,
+    /// Film strips.
+    #[serde(default)]
+    pub film: FilmSettings,
+    /// The pre-training phase.
+    #[serde(default)]
+    pub pretrain: PretrainSettings,
+}
+
+fn metrics_every() -> u64 {
+    20
+}
+
+fn checkpoint_every() -> u64 {
+    500
+}
+
+/// Experience and the batches drawn from it.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields, default)]
+pub struct ReplaySettings {
+    /// Steps held; the oldest episodes leave. A step takes 12 KiB, with a mask 16 KiB.
+    pub capacity_steps: usize,
+    /// B: sequences in a batch.
+    pub batch: usize,
+    /// T: steps of a sequence.
+    pub length: usize,
+    /// Batches drawn ahead of their use.
+    pub prefetch: usize,
+}
+
+impl Default for ReplaySettings {
+    /// The paper's (Table 2), for pre-training.
+    fn default() -> Self {
+        Self { capacity_steps: 2_000_000, batch: 16, length: 64, prefetch: 4 }
+    }
+}
+
+/// Pre-training: `warm_up_updates` on the masked trajectories with the mask loss, then mask-free ones on everything.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields, default)]
+pub struct PretrainSettings {
+    /// Updates with masks.
+    pub warm_up_updates: u64,
+    /// Updates in all, warm-up included.
+    pub updates: u64,
+}
+
+impl Default for PretrainSettings {
+    /// The paper's (Table 2).
+    fn default() -> Self {
+        Self { warm_up_updates: 1000, updates: 500_000 }
+    }
+}
+
+impl TrainingSettings {
+    /// A run of a preset on the episodes in `data`.
+    #[must_use]
+    pub fn preset(preset: Preset, kind: ModelKind, data: PathBuf) -> Self {
+        let paper = ReplaySettings::default();
+        let (name, replay, pretrain) = match preset {
+            Preset::Debug => (
+                "debug",
+                ReplaySettings { batch: 2, length: 6, ..paper },
+                PretrainSettings { warm_up_updates: 10, updates: 40 },
+            ),
+            Preset::Small => (
+                "small",
+                ReplaySettings { batch: 8, length: 32, ..paper },
+                PretrainSettings { warm_up_updates: 1000, updates: 20_000 },
+            ),
+            Preset::Paper => ("paper", paper, PretrainSettings::default()),
+        };
+        Self {
+            preset: name.to_owned(),
+            seed: 0,
+            data,
+            masks: PathBuf::new(),
+            metrics_every: metrics_every(),
+            checkpoint_every: checkpoint_every(),
+            model: ModelSettings::preset(preset, kind),
+            world: WorldSettings::default(),
+            behaviour: BehaviourSettings::default(),
+            replay,
+            film: FilmSettings::default(),
+            pretrain,
+        }
+    }
+
+    /// Checks what TOML's types do not.
+    ///
+    /// # Errors
+    /// [`SettingsError::Invalid`] names the setting, what was found and what is accepted.
+    pub fn validate(&self) -> Result<(), SettingsError> {
+        self.model.validate()?;
+        let replay = &self.replay;
+        for (name, value, least) in [
+            ("replay.batch", replay.batch, 1),
+            ("replay.length", replay.length, 2),
+            ("replay.prefetch", replay.prefetch, 1),
+            ("replay.capacity_steps", replay.capacity_steps, replay.length),
+            ("behaviour.horizon.length", self.behaviour.horizon.length, 2),
+        ] {
+            if value < least {
+                return Err(SettingsError::Invalid(format!("{name} = {value}, expected at least {least}")));
+            }
+        }
+        for (name, every) in
+            [("metrics_every", self.metrics_every), ("checkpoint_every", self.checkpoint_every)]
+        {
+            if every == 0 {
+                return Err(SettingsError::Invalid(format!("{name} = 0, expected at least 1")));
+            }
+        }
+        for (name, adam) in [
+            ("world.adam", &self.world.adam),
+            ("behaviour.actor", &self.behaviour.actor),
+            ("behaviour.critic", &self.behaviour.critic),
+        ] {
+            let positive = |x: f64| x.is_finite() && x > 0.0;
+            let decays = |x: f64| (0.0..1.0).contains(&x);
+            let valid = [adam.learning_rate, adam.eps, adam.clip_norm].into_iter().all(positive);
+            if !valid || !decays(adam.beta1) || !decays(adam.beta2) {
+                let expected = "positive learning_rate, eps and clip_norm, beta1 and beta2 in [0, 1)";
+                return Err(SettingsError::Invalid(format!("{name}: found {adam:?}, expected {expected}")));
+            }
+        }
+        Ok(())
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn presets_are_valid_and_survive_toml() {
+        for preset in [Preset::Debug, Preset::Small, Preset::Paper] {
+            for kind in [ModelKind::Rcwm, ModelKind::Vanilla] {
+                let settings = TrainingSettings::preset(preset, kind, "data".into());
+                settings.validate().unwrap();
+                let text = toml::to_string(&settings).unwrap();
+                assert_eq!(toml::from_str::<TrainingSettings>(&text).unwrap(), settings);
+            }
+        }
+    }
+
+    #[test]
+    fn the_paper_preset_has_the_papers_values() {
+        let settings = TrainingSettings::preset(Preset::Paper, ModelKind::Rcwm, "data".into());
+        assert_eq!((settings.replay.batch, settings.replay.length), (16, 64));
+        assert_eq!((settings.pretrain.warm_up_updates, settings.pretrain.updates), (1000, 500_000));
+        assert_eq!((settings.world.reward_scale, settings.world.adam.learning_rate), (100.0, 1e-4));
+        let behaviour = &settings.behaviour;
+        assert_eq!((behaviour.horizon.length, behaviour.actor.learning_rate), (15, 3e-5));
+        assert_eq!((behaviour.entropy_scale, behaviour.horizon.discount), (3e-4, 0.997));
+    }
+
+    #[test]
+    fn settings_that_cannot_work_are_refused_by_name() {
+        let mut settings = TrainingSettings::preset(Preset::Debug, ModelKind::Rcwm, "data".into());
+        settings.replay.length = 1;
+        assert!(settings.validate().unwrap_err().to_string().contains("replay.length = 1"));
+        settings.replay.length = 2;
+        settings.world.adam.learning_rate = -1.0;
+        assert!(settings.validate().unwrap_err().to_string().contains("world.adam"));
+    }
+}

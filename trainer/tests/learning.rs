@@ -1,0 +1,192 @@
+//! Learning: the authors' numbers, who gets a gradient in which phase, and that the same seed gives the same weights.
+
+#![allow(clippy::unwrap_used)]
+
+use std::path::Path;
+
+use candle_core::{Device, Tensor};
+use rand::{Rng, SeedableRng};
+use rand_chacha::ChaCha8Rng;
+use rcwm_models::settings::{ModelKind, ModelSettings, Preset};
+use rcwm_models::{ACTION_LEN, IMAGE_BYTES, MASK_BYTES};
+use rcwm_trainer::behaviour::{BehaviourLearner, BehaviourSettings, Horizon};
+use rcwm_trainer::learning::{Batch, HostBatch, Side, Trained, WorldLearner, WorldSettings, side_of};
+use rcwm_trainer::model::agent;
+use rcwm_trainer::model::latent::Sampler;
+use rcwm_trainer::model::parameters::Parameters;
+use rcwm_trainer::parity::{self, Group};
+
+/// A softmax does not see what is added to all of its inputs: the true gradient of the keys' bias is 0.
+const BLIND: &str = "interaction.key.bias";
+
+#[test]
+fn one_update_of_the_authors_implementation_is_ours_in_every_number() {
+    let file = Path::new(env!("CARGO_MANIFEST_DIR")).join("../tests/data/rcwm-small.safetensors");
+    let report = parity::check_file(&file, &Group::ALL, &Device::Cpu).unwrap();
+    for group in &report.groups {
+        assert!(group.passes(), "{}: {:?}", group.group.as_str(), group.worst());
+    }
+    assert!(report.unchecked.is_empty(), "{:?}", report.unchecked);
+}
+
+/// Parameters away from their start, where the layers that begin at 0 let gradients through.
+fn lively_parameters(model: &ModelSettings) -> Parameters {
+    let parameters = agent::initialise(model, 1, &Device::Cpu).unwrap();
+    let mut generator = ChaCha8Rng::seed_from_u64(2);
+    for (_, var) in parameters.iter() {
+        let noise: Vec<f32> = (0..var.elem_count()).map(|_| generator.random_range(-0.05..0.05)).collect();
+        let noise = Tensor::from_vec(noise, var.dims(), &Device::Cpu).unwrap();
+        var.set(&(var.as_tensor() + noise).unwrap().detach()).unwrap();
+    }
+    parameters
+}
+
+fn batch(rows: usize, length: usize, masks: bool) -> Batch {
+    let mut generator = ChaCha8Rng::seed_from_u64(3);
+    let steps = rows * length;
+    let mut bytes =
+        |count: usize, most: u8| (0..count).map(|_| generator.random_range(0..=most)).collect::<Vec<u8>>();
+    let image = bytes(steps * IMAGE_BYTES, 255);
+    let robot_mask = if masks { bytes(steps * MASK_BYTES, 1) } else { Vec::new() };
+    let mut first = vec![false; steps];
+    first[0] = true;
+    first[steps - 1] = true;
+    let host = HostBatch {
+        rows,
+        length,
+        image,
+        action: (0..steps * ACTION_LEN).map(|_| generator.random_range(-1.5..1.5)).collect(),
+        reward: (0..steps).map(|_| generator.random_range(-1.0..10.0)).collect(),
+        terminal: (0..steps).map(|step| step == 1).collect(),
+        first,
+        robot_mask,
+    };
+    host.into_tensors(&Device::Cpu).unwrap()
+}
+
+/// Asserts that exactly the trained parameters get a gradient from `loss`, and a finite one that is not 0.
+fn assert_gradients(phase: &str, loss: &Tensor, parameters: &Parameters, trained: Trained) {
+    let store = loss.backward().unwrap();
+    let trains = trained.filter();
+    for (name, var) in parameters.iter() {
+        match store.get(var) {
+            None => assert!(!trains(name), "{phase}: {name} gets no gradient"),
+            Some(gradient) => {
+                assert!(trains(name), "{phase}: {name} is frozen and gets a gradient");
+                let largest = gradient.abs().unwrap().flatten_all().unwrap().max(0).unwrap();
+                let largest = largest.to_scalar::<f32>().unwrap();
+                let finite =
+                    gradient.sqr().unwrap().sum_all().unwrap().to_scalar::<f32>().unwrap().is_finite();
+                assert!(finite && (largest > 0.0 || name == BLIND), "{phase}: {name}: {largest}");
+            }
+        }
+    }
+}
+
+fn assert_gradients_in_every_phase(preset: Preset, kind: ModelKind, rows: usize) {
+    let model = ModelSettings::preset(preset, kind);
+    let parameters = lively_parameters(&model);
+    let settings = WorldSettings { free_nats: 0.0, ..WorldSettings::default() };
+    let mut phases = vec![
+        ("warm-up with masks", true, Trained::World),
+        ("mask-free", false, Trained::World),
+        ("environment's side only, with masks", true, Trained::Environment),
+        ("environment's side only", false, Trained::Environment),
+    ];
+    if kind == ModelKind::Vanilla {
+        // The baseline has one branch: no part of it but the heads is the environment's.
+        phases.truncate(2);
+    }
+    let mut start = None;
+    for (phase, masks, trained) in phases {
+        let learner = WorldLearner::new(&parameters, &model, &settings, trained).unwrap();
+        let losses = learner.losses(&batch(rows, 3, masks), &mut Sampler::seeded(4)).unwrap();
+        assert_eq!(losses.robot_mask.is_some(), masks);
+        assert_gradients(phase, &losses.total, &parameters, trained);
+        start = Some(losses.observed.posteriors.map(|x| x.detach().flatten(0, 1)).unwrap());
+    }
+    let settings = BehaviourSettings {
+        horizon: Horizon { length: 3, ..Horizon::default() },
+        ..BehaviourSettings::default()
+    };
+    let learner = BehaviourLearner::new(&parameters, &model, &settings).unwrap();
+    let imagined = learner.imagine(&start.unwrap(), &mut Sampler::seeded(5)).unwrap();
+    let actor = rcwm_trainer::behaviour::actor_loss(&imagined, 1.0, settings.entropy_scale).unwrap();
+    assert_gradients("behaviour, actor", &actor, &parameters, Trained::Actor);
+    let critic = learner.critic_loss(&imagined).unwrap();
+    assert_gradients("behaviour, critic", &critic, &parameters, Trained::Critic);
+}
+
+#[test]
+fn exactly_the_trained_variables_of_the_debug_preset_get_gradients_in_every_phase() {
+    assert_gradients_in_every_phase(Preset::Debug, ModelKind::Rcwm, 2);
+    assert_gradients_in_every_phase(Preset::Debug, ModelKind::Vanilla, 2);
+}
+
+#[test]
+fn exactly_the_trained_variables_of_the_small_preset_get_gradients_in_every_phase() {
+    assert_gradients_in_every_phase(Preset::Small, ModelKind::Rcwm, 2);
+    assert_gradients_in_every_phase(Preset::Small, ModelKind::Vanilla, 2);
+}
+
+#[test]
+fn exactly_the_trained_variables_of_the_paper_preset_get_gradients_in_every_phase() {
+    assert_gradients_in_every_phase(Preset::Paper, ModelKind::Rcwm, 1);
+    assert_gradients_in_every_phase(Preset::Paper, ModelKind::Vanilla, 1);
+}
+
+fn values(parameters: &Parameters) -> Vec<(String, Vec<f32>)> {
+    let values = |var: &candle_core::Var| var.flatten_all().unwrap().to_vec1::<f32>().unwrap();
+    parameters.iter().map(|(name, var)| (name.to_owned(), values(var))).collect()
+}
+
+#[test]
+fn an_update_moves_what_it_trains_and_nothing_else() {
+    let model = ModelSettings::preset(Preset::Debug, ModelKind::Rcwm);
+    let parameters = lively_parameters(&model);
+    let before = values(&parameters);
+    let settings = WorldSettings { free_nats: 0.0, ..WorldSettings::default() };
+    let mut learner = WorldLearner::new(&parameters, &model, &settings, Trained::Environment).unwrap();
+    let update = learner.update(&batch(2, 3, false), &mut Sampler::seeded(4)).unwrap();
+    let between = values(&parameters);
+    for ((name, old), (_, new)) in before.iter().zip(&between) {
+        assert_eq!(old != new, side_of(name) == Side::Environment, "{name}");
+    }
+    let mut learner = BehaviourLearner::new(&parameters, &model, &BehaviourSettings::default()).unwrap();
+    let start = update.posteriors.map(|x| x.flatten(0, 1)).unwrap();
+    learner.update(&start, &mut Sampler::seeded(5)).unwrap();
+    for ((name, old), (_, new)) in between.iter().zip(&values(&parameters)) {
+        let moves = matches!(side_of(name), Side::Actor | Side::Critic | Side::SlowCritic);
+        assert_eq!(old != new, moves, "{name}");
+    }
+}
+
+#[test]
+fn learning_on_one_batch_lowers_its_loss() {
+    for kind in [ModelKind::Rcwm, ModelKind::Vanilla] {
+        let model = ModelSettings::preset(Preset::Debug, kind);
+        let parameters = agent::initialise(&model, 1, &Device::Cpu).unwrap();
+        let mut settings = WorldSettings::default();
+        settings.adam.learning_rate = 1e-3;
+        let mut learner = WorldLearner::new(&parameters, &model, &settings, Trained::World).unwrap();
+        let batch = batch(2, 4, true);
+        let losses: Vec<f64> = (0..20)
+            .map(|n| learner.update(&batch, &mut Sampler::numbered(6, n)).unwrap().losses.total)
+            .collect();
+        assert!(losses[19] < 0.9 * losses[0], "{losses:?}");
+    }
+}
+
+#[test]
+fn a_loss_that_is_not_finite_leaves_the_parameters_as_they_were() {
+    let model = ModelSettings::preset(Preset::Debug, ModelKind::Rcwm);
+    let parameters = agent::initialise(&model, 1, &Device::Cpu).unwrap();
+    let before = values(&parameters);
+    let mut learner =
+        WorldLearner::new(&parameters, &model, &WorldSettings::default(), Trained::World).unwrap();
+    let mut batch = batch(1, 2, false);
+    batch.terminal = (batch.terminal * f64::NAN).unwrap();
+    let error = learner.update(&batch, &mut Sampler::seeded(1)).unwrap_err();
+    assert!(error.to_string().contains("resume from the last checkpoint"), "{error}");
+    assert_eq!(values(&parameters), before);
+}

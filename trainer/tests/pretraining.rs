@@ -1,0 +1,163 @@
+//! A run of pre-training can be stopped, resumed and read at any time.
+
+#![allow(clippy::unwrap_used)]
+
+use std::fs;
+use std::path::Path;
+use std::sync::atomic::{AtomicBool, Ordering};
+
+use candle_core::Device;
+use ndarray::{Array1, Array2, Array3, Array4};
+use rcwm_models::episode::Episode;
+use rcwm_models::settings::{ModelKind, Preset};
+use rcwm_trainer::checkpoint::Checkpoint;
+use rcwm_trainer::model::parameters::Parameters;
+use rcwm_trainer::replay::Replay;
+use rcwm_trainer::training::{Outcome, Pretraining, Run, TrainingError, TrainingSettings};
+
+/// A bright square, the robot, that moves over a dark ground with the action.
+fn episode(steps: usize, shift: usize, masked: bool) -> Episode {
+    let inside = |t: usize, y: usize, x: usize| (8..24).contains(&y) && (x + 64 - (t + shift) % 64) % 64 < 16;
+    let no = Array1::from_elem(steps, false);
+    let mut is_first = no.clone();
+    is_first[0] = true;
+    Episode {
+        image: Array4::from_shape_fn(
+            (steps, 64, 64, 3),
+            |(t, y, x, _)| if inside(t, y, x) { 220 } else { 30 },
+        ),
+        action: Array2::from_elem((steps, 4), 0.5),
+        reward: (0..steps).map(|t| t as f32 * 0.1).collect(),
+        is_first,
+        is_last: no.clone(),
+        is_terminal: no.clone(),
+        success: no,
+        robot_mask: masked.then(|| Array3::from_shape_fn((steps, 64, 64), |(t, y, x)| inside(t, y, x))),
+        proprio: None,
+    }
+}
+
+fn replay() -> Replay {
+    let mut replay = Replay::new(1000);
+    replay.add("reach", episode(20, 0, true)).unwrap();
+    replay.add("reach", episode(15, 9, false)).unwrap();
+    replay.add("hammer", episode(30, 30, true)).unwrap();
+    replay
+}
+
+fn settings(kind: ModelKind, updates: u64) -> TrainingSettings {
+    let mut settings = TrainingSettings::preset(Preset::Debug, kind, "memory".into());
+    settings.pretrain.warm_up_updates = 4;
+    settings.pretrain.updates = updates;
+    settings.metrics_every = 2;
+    settings.checkpoint_every = 5;
+    settings
+}
+
+fn train(training: &mut Pretraining) -> Outcome {
+    training.run(replay(), &AtomicBool::new(false), |_| ()).unwrap()
+}
+
+fn bits(parameters: &Parameters) -> Vec<(String, Vec<u32>)> {
+    let bits = |var: &candle_core::Var| {
+        var.flatten_all().unwrap().to_vec1::<f32>().unwrap().into_iter().map(f32::to_bits).collect()
+    };
+    parameters.iter().map(|(name, var)| (name.to_owned(), bits(var))).collect()
+}
+
+fn updates_logged(folder: &Path) -> Vec<u64> {
+    let text = fs::read_to_string(folder.join("metrics.jsonl")).unwrap();
+    let update =
+        |line: &str| serde_json::from_str::<serde_json::Value>(line).unwrap()["update"].as_u64().unwrap();
+    text.lines().map(update).collect()
+}
+
+#[test]
+fn a_resumed_run_gives_the_same_weights_as_one_that_never_stopped() {
+    for kind in [ModelKind::Rcwm, ModelKind::Vanilla] {
+        let folder = tempfile::tempdir().unwrap();
+        let (whole, halves) = (folder.path().join("whole"), folder.path().join("halves"));
+        let mut training = Pretraining::create(&whole, settings(kind, 12), &Device::Cpu).unwrap();
+        assert_eq!(train(&mut training), Outcome { updates: 12, interrupted: false });
+        let expected = bits(training.parameters());
+
+        let mut first = Pretraining::create(&halves, settings(kind, 6), &Device::Cpu).unwrap();
+        train(&mut first);
+        assert_ne!(bits(first.parameters()), expected);
+        drop(first);
+        let mut second = Pretraining::resume(&halves, settings(kind, 12), &Device::Cpu).unwrap();
+        assert_eq!(second.updates(), 6);
+        train(&mut second);
+        assert!(bits(second.parameters()) == expected, "{kind:?}: not the same bits");
+        assert_eq!(updates_logged(&halves), updates_logged(&whole));
+        let stored = Checkpoint::read(&Run::last(&halves), &Device::Cpu).unwrap();
+        assert!(bits(&stored.parameters) == expected);
+    }
+}
+
+#[test]
+fn a_run_that_died_after_a_checkpoint_repeats_what_was_lost() {
+    let folder = tempfile::tempdir().unwrap();
+    let (whole, died) = (folder.path().join("whole"), folder.path().join("died"));
+    let mut training = Pretraining::create(&whole, settings(ModelKind::Rcwm, 8), &Device::Cpu).unwrap();
+    train(&mut training);
+    let mut first = Pretraining::create(&died, settings(ModelKind::Rcwm, 5), &Device::Cpu).unwrap();
+    train(&mut first);
+    // What a run that was killed two updates later leaves behind: metrics beyond the checkpoint, the last line cut off.
+    let metrics = died.join("metrics.jsonl");
+    let text = fs::read_to_string(&metrics).unwrap();
+    fs::write(&metrics, format!("{text}{{\"update\":6,\"phase\":\"mask_free\"}}\n{{\"upda")).unwrap();
+    let unfinished = Run::last(&died).join(".writing-abc");
+    fs::write(&unfinished, "half a file").unwrap();
+    let mut second = Pretraining::resume(&died, settings(ModelKind::Rcwm, 8), &Device::Cpu).unwrap();
+    train(&mut second);
+    assert!(bits(second.parameters()) == bits(training.parameters()));
+    assert_eq!(updates_logged(&died), [2, 4, 6, 8]);
+    assert!(!unfinished.exists());
+}
+
+#[test]
+fn a_stopped_run_is_saved_where_it_was() {
+    let folder = tempfile::tempdir().unwrap();
+    let mut training =
+        Pretraining::create(folder.path(), settings(ModelKind::Rcwm, 100), &Device::Cpu).unwrap();
+    let stop = AtomicBool::new(false);
+    let halt = |updates| stop.store(updates >= 7, Ordering::Relaxed);
+    let outcome = training.run(replay(), &stop, |progress| halt(progress.updates)).unwrap();
+    assert_eq!(outcome, Outcome { updates: 7, interrupted: true });
+    let stored = Checkpoint::read(&Run::last(folder.path()), &Device::Cpu).unwrap();
+    assert_eq!(stored.settings.updates, 7);
+    assert!(folder.path().join("checkpoints/best/checkpoint.toml").exists());
+    let files = fs::read_dir(Run::last(folder.path())).unwrap().count();
+    assert!(folder.path().join("films/000007-reach.png").exists());
+    assert_eq!(files, 3, "checkpoint.toml, one file of weights, one of the optimiser");
+}
+
+#[test]
+fn masks_count_in_the_warm_up_only_and_losses_fall() {
+    let folder = tempfile::tempdir().unwrap();
+    let mut settings = settings(ModelKind::Rcwm, 40);
+    settings.pretrain.warm_up_updates = 20;
+    settings.world.adam.learning_rate = 1e-3;
+    let mut training = Pretraining::create(folder.path(), settings, &Device::Cpu).unwrap();
+    let mut lines = Vec::new();
+    training
+        .run(replay(), &AtomicBool::new(false), |progress| lines.extend(progress.metrics.cloned()))
+        .unwrap();
+    assert_eq!(lines.len(), 20);
+    assert!(lines.iter().all(|line| line.losses.robot_mask.is_some() == (line.phase == "warm_up")));
+    assert!(lines[19].losses.image < 0.7 * lines[0].losses.image, "{:?}", lines[19]);
+}
+
+#[test]
+fn a_run_is_neither_overwritten_nor_resumed_where_there_is_none_or_with_another_model() {
+    let folder = tempfile::tempdir().unwrap();
+    assert!(matches!(Run::settings(folder.path()), Err(TrainingError::NothingToResume { .. })));
+    let mut training =
+        Pretraining::create(folder.path(), settings(ModelKind::Rcwm, 1), &Device::Cpu).unwrap();
+    train(&mut training);
+    let again = Pretraining::create(folder.path(), settings(ModelKind::Rcwm, 1), &Device::Cpu);
+    assert!(matches!(again, Err(TrainingError::Exists { .. })));
+    let other = Pretraining::resume(folder.path(), settings(ModelKind::Vanilla, 1), &Device::Cpu);
+    assert!(matches!(other, Err(TrainingError::OtherModel)));
+}
