@@ -6,7 +6,7 @@ use super::encoder::KERNEL_AREA;
 use super::init::Init;
 use super::layers::{Linear, NORM_EPS, Norm};
 use super::parameters::{Built, Scope};
-use crate::ops;
+use crate::ops::{self, ConvLayer};
 
 /// What one decoder paints.
 #[derive(Debug, Clone)]
@@ -66,9 +66,10 @@ impl Decoder {
     pub fn forward(&self, state: &Tensor) -> Result<Picture> {
         let lead = &state.dims()[..state.rank() - 1];
         let x = self.linear.forward(state)?.reshape(((), 4, 4, self.channels))?; // [N, 4, 4, 8c]
-        let x = self.hidden.iter().try_fold(x, |x, (weight, norm)| norm.silu(&ops::conv_up(&x, weight)?))?; // [N, 32, 32, c]
         let (weight, bias) = &self.last;
-        let x = ops::conv_up(&x, weight)?.broadcast_add(bias)?; // [N, 64, 64, 4]
+        let mut layers: Vec<_> = self.hidden.iter().map(|(weight, norm)| norm.after(weight)).collect();
+        layers.push(ConvLayer { bias: Some(bias), ..ConvLayer::bare(weight) });
+        let x = ops::conv_up_stack(&x, &layers)?; // [N, 64, 64, 4]
         let shape = [lead, &x.dims()[1..]].concat();
         let x = x.reshape(shape)?;
         let image = x.narrow(D::Minus1, 0, 3)?;
