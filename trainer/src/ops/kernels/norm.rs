@@ -1,7 +1,7 @@
 //! LayerNorm over rows, with or without `SiLU` after it.
 
 use super::math::{silu, silu_slope};
-use super::vectorised;
+use super::{norm_narrow, vectorised};
 
 /// Calls `$body` with the widest `N` of 16, 8, 4, 1 that divides `$width`: chunks of `N` then make up a row.
 macro_rules! with_lanes {
@@ -160,6 +160,9 @@ fn forward_rows<const N: usize>(x: &[f32], norm: Norm<'_>, out: &mut [f32]) {
 
 /// `x` [rows, width] normalised into `out`. About 8 flops a number, 25 with `SiLU`; 8 bytes.
 pub fn forward(x: &[f32], norm: Norm<'_>, out: &mut [f32]) {
+    if norm_narrow::forward(x, norm, out) {
+        return;
+    }
     vectorised(
         #[inline(always)]
         || with_lanes!(norm.gain.len(), forward_rows(x, norm, out)),
@@ -214,6 +217,9 @@ fn backward_rows<const N: usize>(
 /// Gradient `dx` of `x` from that of the output, `d_out`; adds those of gain and shift to `sums`. About 20 flops a number, 40 with
 /// `SiLU`; 12 bytes.
 pub fn backward(x: &[f32], norm: Norm<'_>, d_out: &[f32], dx: &mut [f32], sums: &mut NormGrads) {
+    if norm_narrow::backward(x, norm, d_out, dx, sums) {
+        return;
+    }
     vectorised(
         #[inline(always)]
         || with_lanes!(norm.gain.len(), backward_rows(x, norm, d_out, dx, sums)),
