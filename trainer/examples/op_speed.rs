@@ -215,7 +215,10 @@ fn main() -> Result<()> {
     cases.retain(|case| case.name.contains(&filter));
     let peak = peak(repetitions)?;
     println!("gemm peak {:.0} GFLOP/s", peak / 1e9);
-    println!("{:28} {:>9} {:>12} {:>7} {:>9} {:>6}", "op (forward + backward)", "fused ms", "composite ms", "ratio", "GFLOP/s", "share");
+    println!(
+        "{:28} {:>9} {:>12} {:>7} {:>9} {:>6}",
+        "op (forward + backward)", "fused ms", "composite ms", "ratio", "GFLOP/s", "share"
+    );
     for case in &cases {
         let (mut fused, mut composite) = (Vec::new(), Vec::new());
         for _ in 0..repetitions {

@@ -64,6 +64,17 @@ impl Decoder {
     /// # Errors
     /// Those of candle.
     pub fn forward(&self, state: &Tensor) -> Result<Picture> {
+        let x = self.raw(state)?;
+        let image = x.narrow(D::Minus1, 0, 3)?;
+        Ok(Picture { image, mask: ops::sigmoid(&x.narrow(D::Minus1, 3, 1)?)? })
+    }
+
+    /// `state` [..., n*m + d] to the three image channels and the mask's logit, [..., 64, 64, 4], as
+    /// [`picture_loss`](ops::picture_loss) takes them.
+    ///
+    /// # Errors
+    /// Those of candle.
+    pub fn raw(&self, state: &Tensor) -> Result<Tensor> {
         let lead = &state.dims()[..state.rank() - 1];
         let x = self.linear.forward(state)?.reshape(((), 4, 4, self.channels))?; // [N, 4, 4, 8c]
         let (weight, bias) = &self.last;
@@ -71,8 +82,6 @@ impl Decoder {
         layers.push(ConvLayer { bias: Some(bias), ..ConvLayer::bare(weight) });
         let x = ops::conv_up_stack(&x, &layers)?; // [N, 64, 64, 4]
         let shape = [lead, &x.dims()[1..]].concat();
-        let x = x.reshape(shape)?;
-        let image = x.narrow(D::Minus1, 0, 3)?;
-        Ok(Picture { image, mask: ops::sigmoid(&x.narrow(D::Minus1, 3, 1)?)? })
+        x.reshape(shape)
     }
 }

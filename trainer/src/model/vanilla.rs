@@ -94,6 +94,14 @@ impl Vanilla {
         Ok(State { branches: vec![self.branch.draw(self.branch.prior_logits(&h)?, &h, sampler)?] })
     }
 
+    /// The raw picture [..., 64, 64, 4]: what the picture's loss is made of.
+    ///
+    /// # Errors
+    /// Those of candle.
+    pub fn decode_raw(&self, state: &State) -> Result<Vec<Tensor>> {
+        Ok(vec![self.decoder.raw(&state.branches[0].features()?)?])
+    }
+
     /// The image, and the mask that is predicted beside it.
     ///
     /// # Errors

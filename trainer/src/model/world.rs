@@ -116,6 +116,18 @@ impl World {
         State::stack(&states, 1)
     }
 
+    /// The raw pictures of a state, one per branch [..., 64, 64, 4]: three image channels and the mask's logit, as
+    /// [`picture_loss`](crate::ops::picture_loss) takes them.
+    ///
+    /// # Errors
+    /// Those of candle.
+    pub fn decode_raw(&self, state: &State) -> Result<Vec<Tensor>> {
+        match self {
+            Self::Rcwm(model) => model.decode_raw(state),
+            Self::Vanilla(model) => model.decode_raw(state),
+        }
+    }
+
     /// The pictures of a state [..., ...].
     ///
     /// # Errors

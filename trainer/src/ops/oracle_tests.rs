@@ -12,7 +12,9 @@ fn one(x: Result<Tensor>) -> Result<Vec<Tensor>> {
 
 #[test]
 fn layer_norm_and_silu_equal_their_composites() {
-    for (rows, width) in [(1, 1), (3, 5), (7, 8), (4, 12), (5, 16), (33, 4), (16, 8), (35, 32), (2, 48), (2, 255), (700, 128)] {
+    for (rows, width) in
+        [(1, 1), (3, 5), (7, 8), (4, 12), (5, 16), (33, 4), (16, 8), (35, 32), (2, 48), (2, 255), (700, 128)]
+    {
         let inputs = [random(&[rows, width], 1), random(&[width], 2), random(&[width], 3)];
         for eps in [1e-3, 1e-5] {
             // With one column everything is its own mean: values agree, gradients are rounding.

@@ -5,10 +5,11 @@
 //! less than a unit in the last place.
 
 /// `1.5 * 2^23`: adding it rounds to an integer, which then stands in the low bits.
-const ROUND: f32 = 12_582_912.0;
+pub const ROUND: f32 = 12_582_912.0;
 /// ln 2 in two parts; the first has few enough bits for its product with a small integer to be exact.
-const LN_2_HIGH: f32 = 0.693_145_75;
-const LN_2_LOW: f32 = 1.428_606_8e-6;
+pub const LN_2_HIGH: f32 = 0.693_145_75;
+/// The rest of ln 2.
+pub const LN_2_LOW: f32 = 1.428_606_8e-6;
 
 /// `(r, n << 23)` with `x = n ln 2 + r` and `|r| <= ln 2 / 2`.
 #[inline(always)]
@@ -102,17 +103,13 @@ pub fn largest(x: &[f32]) -> f32 {
 /// Partial sums are kept in this many lanes, whatever the instruction set: sums are then the same on all of them.
 pub const LANES: usize = 16;
 
-/// Sum of the lanes, in a fixed order.
+/// Sum of the lanes by halves, in a fixed order. Written out, so that it stays in registers.
 #[inline(always)]
-pub fn sum_lanes(mut lanes: [f32; LANES]) -> f32 {
-    let mut half = LANES / 2;
-    while half > 0 {
-        for lane in 0..half {
-            lanes[lane] += lanes[lane + half];
-        }
-        half /= 2;
-    }
-    lanes[0]
+pub fn sum_lanes(v: [f32; LANES]) -> f32 {
+    let [a, b, c, d, e, f, g, h, i, j, k, l, m, n, o, p] = v;
+    let (a, b, c, d, e, f, g, h) = (a + i, b + j, c + k, d + l, e + m, f + n, g + o, h + p);
+    let (a, b, c, d) = (a + e, b + f, c + g, d + h);
+    (a + c) + (b + d)
 }
 
 /// Sum of `f` over the entries of a slice.

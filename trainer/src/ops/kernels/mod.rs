@@ -10,7 +10,7 @@ pub mod gates;
 pub mod gemm;
 pub mod math;
 pub mod norm;
-pub mod norm_narrow;
+pub mod norm_vector;
 pub mod parallel;
 pub mod picture;
 pub mod tile;

@@ -1,7 +1,7 @@
 //! LayerNorm over rows, with or without `SiLU` after it.
 
 use super::math::{silu, silu_slope};
-use super::{norm_narrow, vectorised};
+use super::{norm_vector, vectorised};
 
 /// Calls `$body` with the widest `N` of 16, 8, 4, 1 that divides `$width`: chunks of `N` then make up a row.
 macro_rules! with_lanes {
@@ -101,17 +101,22 @@ pub fn add_rows(sum: &mut [f32], rows: &[f32]) {
     );
 }
 
-/// Sum of lanes by halves, in a fixed order.
+/// Sum of lanes by halves, in a fixed order. Written out, so that it stays in registers.
 #[inline(always)]
-pub(super) fn total<const N: usize>(mut lanes: [f32; N]) -> f32 {
-    let mut half = N / 2;
-    while half > 0 {
-        for lane in 0..half {
-            lanes[lane] += lanes[lane + half];
+pub(super) fn total<const N: usize>(v: [f32; N]) -> f32 {
+    match *v.as_slice() {
+        [a, b, c, d, e, f, g, h, i, j, k, l, m, n, o, p] => {
+            let (a, b, c, d, e, f, g, h) = (a + i, b + j, c + k, d + l, e + m, f + n, g + o, h + p);
+            let (a, b, c, d) = (a + e, b + f, c + g, d + h);
+            (a + c) + (b + d)
         }
-        half /= 2;
+        [a, b, c, d, e, f, g, h] => {
+            let (a, b, c, d) = (a + e, b + f, c + g, d + h);
+            (a + c) + (b + d)
+        }
+        [a, b, c, d] => (a + c) + (b + d),
+        _ => v.iter().sum(),
     }
-    lanes[0]
 }
 
 /// Mean and `1 / sqrt(variance + eps)` of a row.
@@ -160,7 +165,7 @@ fn forward_rows<const N: usize>(x: &[f32], norm: Norm<'_>, out: &mut [f32]) {
 
 /// `x` [rows, width] normalised into `out`. About 8 flops a number, 25 with `SiLU`; 8 bytes.
 pub fn forward(x: &[f32], norm: Norm<'_>, out: &mut [f32]) {
-    if norm_narrow::forward(x, norm, out) {
+    if norm_vector::forward(x, norm, out) {
         return;
     }
     vectorised(
@@ -217,7 +222,7 @@ fn backward_rows<const N: usize>(
 /// Gradient `dx` of `x` from that of the output, `d_out`; adds those of gain and shift to `sums`. About 20 flops a number, 40 with
 /// `SiLU`; 12 bytes.
 pub fn backward(x: &[f32], norm: Norm<'_>, d_out: &[f32], dx: &mut [f32], sums: &mut NormGrads) {
-    if norm_narrow::backward(x, norm, d_out, dx, sums) {
+    if norm_vector::backward(x, norm, d_out, dx, sums) {
         return;
     }
     vectorised(
