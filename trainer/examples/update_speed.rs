@@ -55,11 +55,10 @@ fn world(agent: &Agent, batch: &Batch, adam: &mut Adam, clock: &mut Clock) -> Re
     let embeds = clock.time("encode", || agent.world.encode(&batch.images))?;
     let observed =
         clock.time("observe", || agent.world.observe(&embeds, &batch.actions, &batch.first, &mut sampler))?;
-    let raws = clock.time("decode", || agent.world.decode_raw(&observed.posteriors))?;
+    let painted =
+        clock.time("decode", || agent.world.picture_loss(&observed.posteriors, &batch.images, None))?;
     let loss = clock.time("losses", || -> candle_core::Result<Tensor> {
-        let raws = raws.iter().map(|raw| raw.flatten(0, 1)).collect::<candle_core::Result<Vec<_>>>()?;
-        let target = batch.images.flatten(0, 1)?;
-        let mut loss = ops::picture_loss(&raws.iter().collect::<Vec<_>>(), &target, None)?.0.sum_all()?;
+        let mut loss = painted.0.sum_all()?;
         for (posterior, prior) in observed.posteriors.branches.iter().zip(&observed.priors.branches) {
             let unimix = agent.settings.unimix;
             loss =
@@ -74,8 +73,7 @@ fn world(agent: &Agent, batch: &Batch, adam: &mut Adam, clock: &mut Clock) -> Re
     let grads = clock.time("backward", || loss.backward())?;
     clock.time("adam", || adam.update(&grads))?;
     let alone = observed.posteriors.map(|x| Ok(x.detach()))?;
-    let raws = agent.world.decode_raw(&alone)?;
-    let loss = (raws[0].sqr()?.mean_all()? + raws[1].sqr()?.mean_all()?)?;
+    let loss = agent.world.picture_loss(&alone, &batch.images, None)?.0.sum_all()?;
     clock.time("(of the decoders)", || loss.backward())?;
     let loss = (embeds[0].sqr()?.mean_all()? + embeds[1].sqr()?.mean_all()?)?;
     clock.time("(of the encoders)", || loss.backward())?;

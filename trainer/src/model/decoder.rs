@@ -76,12 +76,24 @@ impl Decoder {
     /// Those of candle.
     pub fn raw(&self, state: &Tensor) -> Result<Tensor> {
         let lead = &state.dims()[..state.rank() - 1];
-        let x = self.linear.forward(state)?.reshape(((), 4, 4, self.channels))?; // [N, 4, 4, 8c]
-        let (weight, bias) = &self.last;
-        let mut layers: Vec<_> = self.hidden.iter().map(|(weight, norm)| norm.after(weight)).collect();
-        layers.push(ConvLayer { bias: Some(bias), ..ConvLayer::bare(weight) });
-        let x = ops::conv_up_stack(&x, &layers)?; // [N, 64, 64, 4]
+        let x = ops::conv_up_stack(&self.first_map(state)?, &self.layers())?; // [N, 64, 64, 4]
         let shape = [lead, &x.dims()[1..]].concat();
         x.reshape(shape)
+    }
+
+    /// The map that the convolutions start from: `state` [..., n*m + d] to [N, 4, 4, 8c].
+    ///
+    /// # Errors
+    /// Those of candle.
+    pub fn first_map(&self, state: &Tensor) -> Result<Tensor> {
+        self.linear.forward(state)?.reshape(((), 4, 4, self.channels))
+    }
+
+    /// The convolutions from there to [N, 64, 64, 4].
+    #[must_use]
+    pub fn layers(&self) -> Vec<ConvLayer<'_>> {
+        let (weight, bias) = &self.last;
+        let hidden = self.hidden.iter().map(|(weight, norm)| norm.after(weight));
+        hidden.chain([ConvLayer { bias: Some(bias), ..ConvLayer::bare(weight) }]).collect()
     }
 }

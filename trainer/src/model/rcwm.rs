@@ -168,15 +168,6 @@ impl Rcwm {
         Ok(State { branches: vec![robot, environment] })
     }
 
-    /// Both branches' raw pictures [..., 64, 64, 4], the robot's first: what the picture's loss is made of.
-    ///
-    /// # Errors
-    /// Those of candle.
-    pub fn decode_raw(&self, state: &State) -> Result<Vec<Tensor>> {
-        let pairs = self.decoders.iter().zip(&state.branches);
-        pairs.map(|(decoder, latent)| decoder.raw(&latent.features()?)).collect()
-    }
-
     /// Both branches' pictures and their sum (eq. 8).
     ///
     /// # Errors

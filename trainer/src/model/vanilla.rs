@@ -15,7 +15,8 @@ use super::world::{Decoded, Observed, at_step, normalised_action, sequence};
 pub struct Vanilla {
     encoder: ConvStack,
     branch: Branch,
-    decoder: Decoder,
+    /// Its picture.
+    pub decoder: Decoder,
 }
 
 impl Vanilla {
@@ -92,14 +93,6 @@ impl Vanilla {
     pub fn imagine_step(&self, state: &State, action: &Tensor, sampler: &mut Sampler) -> Result<State> {
         let h = self.recur(&state.branches[0], action)?;
         Ok(State { branches: vec![self.branch.draw(self.branch.prior_logits(&h)?, &h, sampler)?] })
-    }
-
-    /// The raw picture [..., 64, 64, 4]: what the picture's loss is made of.
-    ///
-    /// # Errors
-    /// Those of candle.
-    pub fn decode_raw(&self, state: &State) -> Result<Vec<Tensor>> {
-        Ok(vec![self.decoder.raw(&state.branches[0].features()?)?])
     }
 
     /// The image, and the mask that is predicted beside it.

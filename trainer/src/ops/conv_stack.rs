@@ -84,6 +84,27 @@ const SHARE_NUMBERS_MIN: usize = 8_192;
 /// # Errors
 /// Those of candle (shapes).
 pub fn stack(direction: Direction, x: &Tensor, layers: &[ConvLayer<'_>]) -> Result<Tensor> {
+    let Applied { inputs, out, shape, kept } = apply(direction, x, layers)?;
+    record_one(&inputs.iter().collect::<Vec<_>>(), out, shape, kept)
+}
+
+/// A stack's results outside candle's graph.
+pub struct Applied {
+    /// x, then every layer's weight, gain and shift or bias.
+    pub inputs: Vec<Tensor>,
+    /// The last layer's output.
+    pub out: Vec<f32>,
+    /// Its shape.
+    pub shape: (usize, usize, usize, usize),
+    /// For the way back.
+    pub kept: Kept,
+}
+
+/// Applies the layers without putting the result into candle's graph.
+///
+/// # Errors
+/// Those of candle (shapes).
+pub fn apply(direction: Direction, x: &Tensor, layers: &[ConvLayer<'_>]) -> Result<Applied> {
     let op = direction.name();
     let (batch, height, width, channels) = x.dims4()?;
     let mut maps = vec![Map { height, width, channels }];
@@ -124,7 +145,7 @@ pub fn stack(direction: Direction, x: &Tensor, layers: &[ConvLayer<'_>]) -> Resu
     let mut kept = Kept { direction, x: inputs[0].detach(), maps, layers: kept, pre: Vec::new() };
     let out = kept.forward(batch, keep)?;
     let shape = (batch, from.height, from.width, from.channels);
-    record_one(&inputs.iter().collect::<Vec<_>>(), out, shape, kept)
+    Ok(Applied { inputs, out, shape, kept })
 }
 
 struct KeptLayer {
@@ -145,7 +166,8 @@ impl KeptLayer {
     }
 }
 
-struct Kept {
+/// What a stack's backward pass needs.
+pub struct Kept {
     direction: Direction,
     x: Tensor,
     /// The input's map and every layer's.

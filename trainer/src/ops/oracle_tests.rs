@@ -295,6 +295,35 @@ fn stacks_of_convolutions_equal_layer_after_layer() {
 }
 
 #[test]
+fn the_painted_loss_is_the_loss_of_the_painted_pictures() {
+    let bytes: Vec<u8> = (0..2 * 16 * 16 * 3).map(|i| (i * 91 % 256) as u8).collect();
+    let image = Tensor::from_vec(bytes, (2, 16, 16, 3), &Device::Cpu).unwrap();
+    let mask = uniform(&[2, 16, 16], 5, 0.0, 1.0);
+    let inputs = stack_inputs(false, 2, 2, [3, 8, 8, 4], true);
+    let robot = [inputs.clone(), inputs[1..].iter().map(|x| (x * 0.7).unwrap()).collect()].concat();
+    let all =
+        |(loss, mask_loss): (Tensor, Option<Tensor>)| [vec![loss], mask_loss.into_iter().collect()].concat();
+    let count = inputs.len();
+    let both = move |x: &[Tensor]| {
+        let environment = [&x[..1], &x[count..]].concat();
+        (x[..count].to_vec(), environment)
+    };
+    agree(
+        &robot,
+        |x| {
+            let (a, b) = both(x);
+            painted_loss(&[(&a[0], &stack_layers(&a)), (&b[0], &stack_layers(&b))], &image, Some(&mask))
+                .map(all)
+        },
+        |x| {
+            let (a, b) = both(x);
+            let raws = [conv_up_stack(&a[0], &stack_layers(&a))?, conv_up_stack(&b[0], &stack_layers(&b))?];
+            composite::picture_loss(&[&raws[0], &raws[1]], &image, Some(&mask)).map(all)
+        },
+    );
+}
+
+#[test]
 fn images_without_gradient_cost_none_and_change_nothing() {
     let inputs = stack_inputs(true, 2, 8, [3, 4, 4, 4], false);
     let image = inputs[0].clone();

@@ -1,4 +1,4 @@
-use candle_core::{CpuStorage, DType, Device, Error, Result, Storage, Tensor};
+use candle_core::{CpuStorage, DType, Device, Error, Result, Shape, Storage, Tensor};
 
 use super::composite;
 use super::kernels::parallel;
@@ -55,6 +55,23 @@ pub fn picture_loss(
     if !fusible(raws) || image.dtype() != DType::U8 {
         return composite::picture_loss(raws, image, mask);
     }
+    let raws = raws.iter().map(|raw| raw.contiguous()).collect::<Result<Vec<_>>>()?;
+    let (outputs, kept) = apply(&raws.iter().collect::<Vec<_>>(), image, mask)?;
+    losses(record(&raws.iter().collect::<Vec<_>>(), outputs, kept)?)
+}
+
+/// The loss, and the mask's where there is one.
+pub(super) fn losses(outputs: Vec<Tensor>) -> Result<(Tensor, Option<Tensor>)> {
+    let mut outputs = outputs.into_iter();
+    let Some(loss) = outputs.next() else { candle_core::bail!("{OP}: no output") };
+    Ok((loss, outputs.next()))
+}
+
+/// Losses outside candle's graph.
+pub(super) type Outputs = Vec<(Vec<f32>, Shape)>;
+
+/// Computes the losses without putting them into candle's graph; `raws` must be contiguous.
+pub(super) fn apply(raws: &[&Tensor], image: &Tensor, mask: Option<&Tensor>) -> Result<(Outputs, Kept)> {
     let (&[first] | &[first, _]) = raws else {
         candle_core::bail!("{OP}: {} pictures, expected one or two", raws.len());
     };
@@ -68,26 +85,25 @@ pub fn picture_loss(
     if let Some(mask) = mask.filter(|mask| mask.dims() != [n, height, width]) {
         return mismatch(OP, first, mask);
     }
-    let raws = raws.iter().map(|raw| raw.contiguous()).collect::<Result<Vec<_>>>()?;
-    let mask =
-        mask.map(|mask| floats(OP, &mask.to_dtype(DType::F32)?.contiguous()?).map(|mask| mask.to_vec()));
+    let mask = match mask {
+        Some(mask) => Some(floats(OP, &mask.to_dtype(DType::F32)?.contiguous()?)?.to_vec()),
+        None => None,
+    };
     let kept = Kept {
-        raws: raws.iter().map(Tensor::detach).collect(),
+        raws: raws.iter().map(|raw| raw.detach()).collect(),
         image: bytes(OP, &image.contiguous()?)?,
-        mask: mask.transpose()?,
+        mask,
         pixels: height * width,
     };
     let (losses, mask_losses) = kept.forward(n)?;
     let mut outputs = vec![(losses, n.into())];
     outputs.extend(kept.mask.is_some().then(|| (mask_losses, n.into())));
-    let mut outputs = record(&raws.iter().collect::<Vec<_>>(), outputs, kept)?.into_iter();
-    let Some(loss) = outputs.next() else { candle_core::bail!("{OP}: no output") };
-    Ok((loss, outputs.next()))
+    Ok((outputs, kept))
 }
 
 const OP: &str = "picture-loss";
 
-struct Kept {
+pub(super) struct Kept {
     raws: Vec<Tensor>,
     image: Vec<u8>,
     mask: Option<Vec<f32>>,
