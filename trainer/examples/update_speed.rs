@@ -91,6 +91,7 @@ fn behave(agent: &Agent, start: &State, clock: &mut Clock) -> Result<()> {
 }
 
 fn main() -> Result<()> {
+    ops::leave_threads_to_ops();
     let arguments: Vec<String> = std::env::args().skip(1).collect();
     let number = |index: usize, default: usize| arguments.get(index).map_or(Ok(default), |text| text.parse());
     let (repetitions, batch, length) = (number(0, 5)?, number(1, 8)?, number(2, 32)?);

@@ -276,3 +276,115 @@ impl<F: FnMut(&mut [f32]) -> Result<()>> InplaceOp1 for InPlace<F> {
         (*body)(&mut values[from..to])
     }
 }
+
+#[cfg(test)]
+mod tests {
+    use candle_core::Device;
+
+    use super::*;
+
+    fn var(values: &[f32]) -> Var {
+        Var::from_slice(values, values.len(), &Device::Cpu).unwrap()
+    }
+
+    fn numbers(x: &Tensor) -> Vec<f32> {
+        x.to_vec1().unwrap()
+    }
+
+    /// Gradients of `sum(weights * x^2) / 2`, which are `weights * x`.
+    fn grads(vars: &[&Var]) -> GradStore {
+        let term = |var: &&Var| (var.sqr().unwrap() * 0.5).unwrap().sum_all().unwrap();
+        let loss = vars.iter().map(term).reduce(|a, b| (a + b).unwrap()).unwrap();
+        loss.backward().unwrap()
+    }
+
+    /// PyTorch's Adam in f64, gradient x, norm clipped.
+    fn reference(x: &mut [f64], settings: AdamSettings, updates: i32) {
+        let (mut mean, mut square) = (vec![0.0; x.len()], vec![0.0; x.len()]);
+        for step in 1..=updates {
+            let norm = x.iter().map(|x| x * x).sum::<f64>().sqrt();
+            let scale = settings.clip.map_or(1.0, |clip| (clip / (norm + 1e-6)).min(1.0));
+            for i in 0..x.len() {
+                let g = x[i] * scale;
+                mean[i] = settings.beta1 * mean[i] + (1.0 - settings.beta1) * g;
+                square[i] = settings.beta2 * square[i] + (1.0 - settings.beta2) * g * g;
+                let (m, v) = (
+                    mean[i] / (1.0 - settings.beta1.powi(step)),
+                    square[i] / (1.0 - settings.beta2.powi(step)),
+                );
+                x[i] -= settings.rate * m / (v.sqrt() + settings.eps);
+            }
+        }
+    }
+
+    #[test]
+    fn updates_equal_the_textbook_with_and_without_clipping() {
+        for clip in [None, Some(1e3), Some(0.5)] {
+            let settings = AdamSettings { clip, eps: 1e-3, ..AdamSettings::new(0.05) };
+            let start: Vec<f32> = (0..100_003).map(|i| (i % 17) as f32 / 8.0 - 1.0).collect();
+            let (x, y) = (var(&start[..3]), var(&start[3..]));
+            let mut adam = Adam::new([("x".into(), x.clone()), ("y".into(), y.clone())], settings).unwrap();
+            for _ in 0..5 {
+                adam.update(&grads(&[&x, &y])).unwrap();
+            }
+            let mut expected: Vec<f64> = start.iter().map(|x| f64::from(*x)).collect();
+            reference(&mut expected, settings, 5);
+            let found = [numbers(&x), numbers(&y)].concat();
+            let worst =
+                found.iter().zip(&expected).map(|(a, b)| (f64::from(*a) - b).abs()).fold(0.0, f64::max);
+            assert!(worst < 2e-5, "{clip:?}: {worst:e}");
+        }
+    }
+
+    #[test]
+    fn the_fused_update_equals_the_composite() {
+        let settings = AdamSettings::new(0.1);
+        let (a, b) = (var(&[1.0, -2.0, 0.5]), var(&[1.0, -2.0, 0.5]));
+        let zeros = || Tensor::zeros(3, DType::F32, &Device::Cpu).unwrap();
+        let slot = |var: &Var| Slot { name: "x".into(), var: var.clone(), mean: zeros(), square: zeros() };
+        let kernel = Kernel {
+            scale: 0.7,
+            beta1: 0.9,
+            beta2: 0.999,
+            keep1: 0.1,
+            keep2: 0.001,
+            rate: settings.rate as f32,
+            root: 1.5,
+            eps: 1e-8,
+        };
+        let grad = Tensor::new(&[0.3f32, 0.0, -4.0], &Device::Cpu).unwrap();
+        let (fused, composite) = (slot(&a), slot(&b));
+        for _ in 0..3 {
+            kernel.fused(&fused, &grad).unwrap();
+            kernel.composite(&composite, &grad).unwrap();
+        }
+        for (found, expected) in numbers(&a).iter().zip(numbers(&b)) {
+            assert!((found - expected).abs() <= 1e-6, "{found} {expected}");
+        }
+    }
+
+    #[test]
+    fn a_saved_state_goes_on_bit_for_bit() {
+        let settings = AdamSettings { clip: Some(1.0), ..AdamSettings::new(0.01) };
+        let x = var(&[1.0, -2.0, 0.5]);
+        let mut adam = Adam::new([("x".into(), x.clone())], settings).unwrap();
+        adam.update(&grads(&[&x])).unwrap();
+        let (state, halfway) = (adam.state().unwrap(), numbers(&x));
+        adam.update(&grads(&[&x])).unwrap();
+        let y = var(&halfway);
+        let mut resumed = Adam::new([("x".into(), y.clone())], settings).unwrap();
+        resumed.restore(&state).unwrap();
+        resumed.update(&grads(&[&y])).unwrap();
+        assert_eq!((numbers(&x), adam.step()), (numbers(&y), resumed.step()));
+        let mut other = Adam::new([("z".into(), y)], settings).unwrap();
+        assert!(other.restore(&state).unwrap_err().to_string().contains("z.mean"));
+    }
+
+    #[test]
+    fn a_gradient_that_is_not_finite_changes_nothing() {
+        let x = var(&[1.0, f32::INFINITY]);
+        let mut adam = Adam::new([("x".into(), x.clone())], AdamSettings::new(0.1)).unwrap();
+        assert!(!adam.update(&grads(&[&x])).unwrap().is_finite());
+        assert_eq!((numbers(&x), adam.step()), (vec![1.0, f32::INFINITY], 0));
+    }
+}

@@ -65,7 +65,11 @@ impl Direction {
         let [first, second, 4, 4] = *weight.dims() else { return None };
         let fits = from.height > 0 && from.width > 0 && first > 0 && second > 0;
         match self {
-            Self::Down if second == from.channels && fits && from.height % 2 == 0 && from.width % 2 == 0 => {
+            Self::Down
+                if second == from.channels
+                    && fits
+                    && [from.height, from.width].iter().all(|side| side.is_multiple_of(2)) =>
+            {
                 Some(Map { height: from.height / 2, width: from.width / 2, channels: first })
             }
             Self::Up if first == from.channels && fits => {

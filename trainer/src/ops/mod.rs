@@ -46,6 +46,7 @@ pub use categorical::{
 pub use cell::{recurrent_cell, recurrent_update};
 pub use conv::{conv_down, conv_down_stack, conv_up, conv_up_stack};
 pub use conv_stack::ConvLayer;
+pub use kernels::parallel::leave_threads_to_ops;
 pub use linear::linear;
 pub use norm::{layer_norm, layer_norm_silu};
 pub use painted::painted_loss;

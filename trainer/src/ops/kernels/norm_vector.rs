@@ -156,7 +156,7 @@ fn plan(width: usize) -> Option<(Arch, usize)> {
     #[cfg(target_arch = "x86_64")]
     let (arch, lanes) = match arch {
         // Rows of 8 are one AVX2 vector, also where there is AVX-512.
-        Arch::V4(simd) if width % 16 != 0 => (Arch::V3(*simd), 8),
+        Arch::V4(simd) if !width.is_multiple_of(16) => (Arch::V3(*simd), 8),
         Arch::V4(_) => (arch, 16),
         Arch::V3(_) => (arch, 8),
         _ => return None,

@@ -9,6 +9,19 @@ pub fn threads() -> usize {
     *THREADS.get_or_init(|| candle_core::utils::get_num_threads().max(1))
 }
 
+/// Leaves the cores to the fused ops: candle's own elementwise operations then run on the calling thread. Its pool spins between
+/// operations, which are short and many in a backward pass, and so takes the core that a fused op's second share needs (an actor's backward
+/// pass took four times as long on two busy cores). `CANDLE_NUM_THREADS`, if set, is respected.
+///
+/// Call it first in `main`, before any thread is started.
+pub fn leave_threads_to_ops() {
+    const NAME: &str = "CANDLE_NUM_THREADS";
+    if std::env::var_os(NAME).is_none() {
+        // SAFETY: the caller has started no thread yet, so nobody reads the environment meanwhile.
+        unsafe { std::env::set_var(NAME, "1") };
+    }
+}
+
 /// Shares of `count` items, at most one a thread and none below `least` items (but for a single one).
 pub fn shares(count: usize, least: usize) -> Vec<Range<usize>> {
     let parts = (count / least.max(1)).clamp(1, threads());
