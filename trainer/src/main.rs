@@ -7,6 +7,7 @@ use std::process::ExitCode;
 use clap::Parser;
 
 fn main() -> ExitCode {
+    rcwm_trainer::ops::leave_threads_to_ops();
     match cli::Arguments::parse().run() {
         Ok(code) => code,
         Err(error) => {

@@ -83,7 +83,7 @@ impl Branch {
     pub fn recur(&self, x: &Tensor, h: &Tensor) -> Result<Tensor> {
         let x = self.input.forward(x)?; // [B, hidden]
         let gates = ops::linear(&Tensor::cat(&[&x, h], D::Minus1)?, &self.cell_weight, None)?; // [B, 3d]
-        ops::recurrent_update(&self.cell_norm.forward(&gates)?, h)
+        self.cell_norm.cell(&gates, h)
     }
 
     /// Logits of the prior `p(z_t | h_t)`: `h` [..., d] to [..., n, m].

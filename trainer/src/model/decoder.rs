@@ -6,7 +6,7 @@ use super::encoder::KERNEL_AREA;
 use super::init::Init;
 use super::layers::{Linear, NORM_EPS, Norm};
 use super::parameters::{Built, Scope};
-use crate::ops;
+use crate::ops::{self, ConvLayer};
 
 /// What one decoder paints.
 #[derive(Debug, Clone)]
@@ -64,14 +64,36 @@ impl Decoder {
     /// # Errors
     /// Those of candle.
     pub fn forward(&self, state: &Tensor) -> Result<Picture> {
-        let lead = &state.dims()[..state.rank() - 1];
-        let x = self.linear.forward(state)?.reshape(((), 4, 4, self.channels))?; // [N, 4, 4, 8c]
-        let x = self.hidden.iter().try_fold(x, |x, (weight, norm)| norm.silu(&ops::conv_up(&x, weight)?))?; // [N, 32, 32, c]
-        let (weight, bias) = &self.last;
-        let x = ops::conv_up(&x, weight)?.broadcast_add(bias)?; // [N, 64, 64, 4]
-        let shape = [lead, &x.dims()[1..]].concat();
-        let x = x.reshape(shape)?;
+        let x = self.raw(state)?;
         let image = x.narrow(D::Minus1, 0, 3)?;
         Ok(Picture { image, mask: ops::sigmoid(&x.narrow(D::Minus1, 3, 1)?)? })
+    }
+
+    /// `state` [..., n*m + d] to the three image channels and the mask's logit, [..., 64, 64, 4], as
+    /// [`picture_loss`](ops::picture_loss) takes them.
+    ///
+    /// # Errors
+    /// Those of candle.
+    pub fn raw(&self, state: &Tensor) -> Result<Tensor> {
+        let lead = &state.dims()[..state.rank() - 1];
+        let x = ops::conv_up_stack(&self.first_map(state)?, &self.layers())?; // [N, 64, 64, 4]
+        let shape = [lead, &x.dims()[1..]].concat();
+        x.reshape(shape)
+    }
+
+    /// The map that the convolutions start from: `state` [..., n*m + d] to [N, 4, 4, 8c].
+    ///
+    /// # Errors
+    /// Those of candle.
+    pub fn first_map(&self, state: &Tensor) -> Result<Tensor> {
+        self.linear.forward(state)?.reshape(((), 4, 4, self.channels))
+    }
+
+    /// The convolutions from there to [N, 64, 64, 4].
+    #[must_use]
+    pub fn layers(&self) -> Vec<ConvLayer<'_>> {
+        let (weight, bias) = &self.last;
+        let hidden = self.hidden.iter().map(|(weight, norm)| norm.after(weight));
+        hidden.chain([ConvLayer { bias: Some(bias), ..ConvLayer::bare(weight) }]).collect()
     }
 }

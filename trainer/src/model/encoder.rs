@@ -1,6 +1,6 @@
 //! Images to features to embeddings.
 
-use candle_core::{DType, Result, Tensor};
+use candle_core::{Result, Tensor};
 
 use super::init::Init;
 use super::layers::{NORM_EPS, Norm};
@@ -10,15 +10,7 @@ use crate::ops;
 /// Kernel area of every convolution.
 pub(super) const KERNEL_AREA: usize = 16;
 
-/// `x/255 - 0.5` of a u8 image, as f32; channels last.
-///
-/// # Errors
-/// Those of candle.
-pub fn image_to_float(image: &Tensor) -> Result<Tensor> {
-    // A division, not a product with the inverse: the last bit then agrees with other implementations.
-    let full = Tensor::new(255f32, image.device())?;
-    image.to_dtype(DType::F32)?.broadcast_div(&full)? - 0.5
-}
+pub use crate::ops::image_to_float;
 
 /// Convolutions that halve the sides, each with LayerNorm over channels and `SiLU`.
 #[derive(Debug, Clone)]
@@ -47,7 +39,8 @@ impl ConvStack {
     /// # Errors
     /// Those of candle.
     pub fn forward(&self, x: &Tensor) -> Result<Tensor> {
-        self.layers.iter().try_fold(x.clone(), |x, (weight, norm)| norm.silu(&ops::conv_down(&x, weight)?))
+        let layers: Vec<_> = self.layers.iter().map(|(weight, norm)| norm.after(weight)).collect();
+        ops::conv_down_stack(x, &layers)
     }
 }
 

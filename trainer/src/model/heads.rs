@@ -14,8 +14,8 @@ use crate::ops;
 #[derive(Debug, Clone)]
 pub struct TwoHotHead {
     mlp: Mlp,
-    /// The bins above 0, in symlog space.
-    positive_bins: Tensor,
+    /// In symlog space, [bins].
+    bins: Tensor,
 }
 
 impl TwoHotHead {
@@ -25,8 +25,7 @@ impl TwoHotHead {
     /// Those of [`Scope::get`].
     pub fn new(scope: &Scope<'_>, settings: &ModelSettings) -> Built<Self> {
         let mlp = Mlp::new(scope, settings.state_width(), settings.units, settings.bins, 0.0)?;
-        let positive = ops::bins(settings.bins).skip(settings.bins / 2 + 1);
-        Ok(Self { mlp, positive_bins: Tensor::from_iter(positive, &scope.device())? })
+        Ok(Self { mlp, bins: ops::bins_tensor(settings.bins, &scope.device())? })
     }
 
     /// Logits [..., bins] of `features` [..., state width].
@@ -42,7 +41,7 @@ impl TwoHotHead {
     /// # Errors
     /// Those of candle.
     pub fn mean(&self, logits: &Tensor) -> Result<Tensor> {
-        ops::two_hot_mean(logits, &self.positive_bins)
+        ops::two_hot_mean(logits, &self.bins)
     }
 }
 

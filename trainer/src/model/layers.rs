@@ -4,7 +4,7 @@ use candle_core::{Result, Tensor};
 
 use super::init::Init;
 use super::parameters::{Built, Scope};
-use crate::ops;
+use crate::ops::{self, ConvLayer};
 
 /// LayerNorm's epsilon everywhere but in the interaction model.
 pub const NORM_EPS: f64 = 1e-3;
@@ -41,6 +41,20 @@ impl Norm {
     /// Those of candle.
     pub fn silu(&self, x: &Tensor) -> Result<Tensor> {
         ops::layer_norm_silu(x, &self.weight, &self.bias, self.eps)
+    }
+
+    /// A convolution of this weight with this normalisation and `SiLU` after it.
+    #[must_use]
+    pub fn after<'a>(&'a self, weight: &'a Tensor) -> ConvLayer<'a> {
+        ConvLayer { weight, norm: Some((&self.weight, &self.bias, self.eps)), bias: None }
+    }
+
+    /// The recurrent cell's update of `h` [..., d] from its linear layer's output `pre` [..., 3d].
+    ///
+    /// # Errors
+    /// Those of candle.
+    pub fn cell(&self, pre: &Tensor, h: &Tensor) -> Result<Tensor> {
+        ops::recurrent_cell(pre, &self.weight, &self.bias, self.eps, h)
     }
 }
 

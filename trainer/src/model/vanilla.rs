@@ -15,7 +15,8 @@ use super::world::{Decoded, Observed, at_step, normalised_action, sequence};
 pub struct Vanilla {
     encoder: ConvStack,
     branch: Branch,
-    decoder: Decoder,
+    /// Its picture.
+    pub decoder: Decoder,
 }
 
 impl Vanilla {

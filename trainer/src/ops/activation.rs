@@ -1,50 +1,97 @@
-use candle_core::{D, Result, Tensor};
+use std::ops::Range;
 
-/// `1 / (1 + exp(-x))`, through tanh: no overflow and no NaN gradient for any x.
+use candle_core::{Result, Tensor};
+
+use super::composite;
+use super::kernels::categorical::{self, Output};
+use super::kernels::{math, vectorised};
+use super::node::fusible;
+use super::rows::{self, RowOp};
+
+/// `1 / (1 + exp(-x))`: no overflow and no NaN gradient for any x.
+///
+/// Cost a number: 15 flops and 8 bytes forward, 20 flops and 12 bytes backward.
 ///
 /// # Errors
 /// Those of candle (shapes, devices).
 pub fn sigmoid(x: &Tensor) -> Result<Tensor> {
-    (x * 0.5)?.tanh()?.affine(0.5, 0.5)
+    if fusible(&[x]) && x.rank() > 0 { rows::apply(x, x.shape(), Sigmoid) } else { composite::sigmoid(x) }
 }
 
 /// Softmax over the last dimension.
 ///
+/// Cost a number: 25 flops and 8 bytes forward, 30 flops and 12 bytes backward.
+///
 /// # Errors
 /// Those of candle (shapes, devices).
 pub fn softmax(x: &Tensor) -> Result<Tensor> {
-    let exp = shifted(x)?.exp()?;
-    exp.broadcast_div(&exp.sum_keepdim(D::Minus1)?)
+    distribution(x, 0.0, Output::Probabilities).unwrap_or_else(|| composite::softmax(x))
 }
 
-/// Logarithm of the softmax over the last dimension.
+/// Logarithm of the softmax over the last dimension. Cost as [`softmax`].
 ///
 /// # Errors
 /// Those of candle (shapes, devices).
 pub fn log_softmax(x: &Tensor) -> Result<Tensor> {
-    let shifted = shifted(x)?;
-    shifted.broadcast_sub(&shifted.exp()?.sum_keepdim(D::Minus1)?.log()?)
+    distribution(x, 0.0, Output::Logarithms).unwrap_or_else(|| composite::log_softmax(x))
 }
 
-/// `x` minus its largest entry, which cancels in a softmax and so needs no gradient.
-fn shifted(x: &Tensor) -> Result<Tensor> {
-    x.broadcast_sub(&x.max_keepdim(D::Minus1)?.detach())
+/// Fused probabilities or their logarithms; none where the composite must do it.
+pub(super) fn distribution(logits: &Tensor, unimix: f64, output: Output) -> Option<Result<Tensor>> {
+    let op = Distribution { unimix: unimix as f32, output };
+    fusible(&[logits]).then(|| rows::apply(logits, logits.shape(), op))
 }
 
-#[cfg(test)]
-mod tests {
-    use super::*;
-    use candle_core::{Device, Var};
+struct Distribution {
+    unimix: f32,
+    output: Output,
+}
 
-    #[test]
-    fn extreme_inputs_give_finite_values_and_gradients() {
-        let x = Var::new(&[[-500f32, 0.0, 500.0]], &Device::Cpu).unwrap();
-        for op in [sigmoid, softmax, log_softmax] {
-            let y = op(&x).unwrap();
-            let grads = y.sum_all().unwrap().backward().unwrap();
-            let grad = grads.get(&x).unwrap().flatten_all().unwrap().to_vec1::<f32>().unwrap();
-            let y = y.flatten_all().unwrap().to_vec1::<f32>().unwrap();
-            assert!(y.iter().chain(&grad).all(|value| value.is_finite()), "{y:?} {grad:?}");
-        }
+impl RowOp for Distribution {
+    const NAME: &'static str = "categorical-distribution";
+
+    fn out_width(&self, width: usize) -> usize {
+        width
+    }
+
+    fn forward(&self, x: &[f32], width: usize, _: Range<usize>, out: &mut [f32]) {
+        categorical::distribution(x, width, self.unimix, self.output, out);
+    }
+
+    fn backward(&self, x: &[f32], width: usize, _: Range<usize>, d_out: &[f32], dx: &mut [f32]) {
+        categorical::distribution_backward(x, width, self.unimix, self.output, d_out, dx);
+    }
+}
+
+struct Sigmoid;
+
+impl RowOp for Sigmoid {
+    const NAME: &'static str = "sigmoid";
+
+    fn out_width(&self, width: usize) -> usize {
+        width
+    }
+
+    fn forward(&self, x: &[f32], _: usize, _: Range<usize>, out: &mut [f32]) {
+        vectorised(
+            #[inline(always)]
+            || {
+                for (out, x) in out.iter_mut().zip(x) {
+                    *out = math::sigmoid(*x);
+                }
+            },
+        );
+    }
+
+    fn backward(&self, x: &[f32], _: usize, _: Range<usize>, d_out: &[f32], dx: &mut [f32]) {
+        vectorised(
+            #[inline(always)]
+            || {
+                for ((dx, x), d) in dx.iter_mut().zip(x).zip(d_out) {
+                    let y = math::sigmoid(*x);
+                    *dx = d * y * (1.0 - y);
+                }
+            },
+        );
     }
 }

@@ -1,0 +1,58 @@
+use candle_core::{DType, Device, Result, Tensor};
+
+use super::conv_stack::{self, ConvLayer, Direction};
+use super::node::{Backward, fusible, record};
+use super::{conv_up_stack, picture, picture_loss};
+
+/// [`picture_loss`] of what the decoders' stacks paint: `conv_up_stack` of each (input, layers), the robot's first.
+///
+/// As one op, because the pictures are by far the largest tensors of an update: nothing of their size, nor of their gradients', passes
+/// through candle. Cost: that of the parts.
+///
+/// # Errors
+/// Those of candle (shapes, devices).
+pub fn painted_loss(
+    stacks: &[(&Tensor, &[ConvLayer<'_>])],
+    image: &Tensor,
+    mask: Option<&Tensor>,
+) -> Result<(Tensor, Option<Tensor>)> {
+    let fused =
+        |(x, layers): &(&Tensor, &[ConvLayer<'_>])| layers.iter().all(|layer| fusible(&[x, layer.weight]));
+    if !stacks.iter().all(fused) || image.dtype() != DType::U8 {
+        let raws = stacks.iter().map(|(x, layers)| conv_up_stack(x, layers)).collect::<Result<Vec<_>>>()?;
+        return picture_loss(&raws.iter().collect::<Vec<_>>(), image, mask);
+    }
+    let (mut inputs, mut raws, mut decoders) = (Vec::new(), Vec::new(), Vec::new());
+    for (x, layers) in stacks {
+        let applied = conv_stack::apply(Direction::Up, x, layers)?;
+        decoders.push((applied.kept, applied.inputs.len()));
+        inputs.extend(applied.inputs);
+        raws.push(Tensor::from_vec(applied.out, applied.shape, &Device::Cpu)?);
+    }
+    let (outputs, loss) = picture::apply(&raws.iter().collect::<Vec<_>>(), image, mask)?;
+    picture::losses(record(&inputs.iter().collect::<Vec<_>>(), outputs, Kept { decoders, loss })?)
+}
+
+struct Kept {
+    /// Each stack with the number of its inputs.
+    decoders: Vec<(conv_stack::Kept, usize)>,
+    loss: picture::Kept,
+}
+
+impl Backward for Kept {
+    fn name(&self) -> &'static str {
+        "painted-loss"
+    }
+
+    fn backward(&self, grads: &[Option<Tensor>], wanted: &[bool]) -> Result<Vec<Option<Tensor>>> {
+        let raws = self.loss.backward(grads, &vec![true; self.decoders.len()])?;
+        let mut found = Vec::with_capacity(wanted.len());
+        let mut rest = wanted;
+        for ((decoder, inputs), grad) in self.decoders.iter().zip(raws) {
+            let (wanted, later) = rest.split_at(*inputs);
+            found.extend(decoder.backward(&[grad], wanted)?);
+            rest = later;
+        }
+        Ok(found)
+    }
+}
