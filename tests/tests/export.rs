@@ -79,7 +79,9 @@ fn a_recorded_episode_becomes_the_golden_values_that_both_engines_reproduce() {
 fn the_authors_numbers_are_reproduced_and_a_wrong_weight_is_noticed() {
     let reference = root().join("tests/data/rcwm-small.safetensors");
     let printed = succeed(trainer(&["parity", reference.to_str().unwrap()]));
-    for group in ["encoder", "observe", "decode", "heads", "actor", "critic", "imagine", "loss", "grad", "updated"] {
+    for group in
+        ["encoder", "observe", "decode", "heads", "actor", "critic", "imagine", "loss", "grad", "updated"]
+    {
         assert!(printed.contains(group), "{group} is reported:\n{printed}");
     }
     let mut bytes = std::fs::read(&reference).unwrap();
