@@ -9,12 +9,14 @@
 //! | [`onnx`] | reading and writing ONNX files |
 //! | [`episode`] | recorded episodes as Dreamer's `.npz` files |
 //! | [`tensors`] | named arrays in safetensors files |
+//! | [`errors`] | errors as one line for people |
 //! | [`files`] | atomic writes, checksums, capped reads |
 //!
 //! This crate never depends on candle, tract or pyo3.
 
 pub mod bundle;
 pub mod episode;
+pub mod errors;
 pub mod files;
 pub mod onnx;
 pub mod settings;

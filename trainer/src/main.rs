@@ -5,13 +5,14 @@ mod cli;
 use std::process::ExitCode;
 
 use clap::Parser;
+use rcwm_models::errors::one_line;
 
 fn main() -> ExitCode {
     rcwm_trainer::ops::leave_threads_to_ops();
     match cli::Arguments::parse().run() {
         Ok(code) => code,
         Err(error) => {
-            eprintln!("rcwm-trainer: {error:#}");
+            eprintln!("rcwm-trainer: {}", one_line(error.as_ref()));
             ExitCode::FAILURE
         }
     }

@@ -22,6 +22,7 @@ use std::sync::atomic::{AtomicBool, Ordering};
 use anyhow::Context;
 use clap::{Parser, Subcommand, ValueEnum};
 use rcwm_models::bundle::Bundle;
+use rcwm_models::errors::one_line;
 use serde::Serialize;
 
 use crate::controller::ControllerError;
@@ -104,25 +105,13 @@ pub fn main() -> ExitCode {
     match result {
         Ok(()) => ExitCode::SUCCESS,
         Err(error) => {
-            eprintln!("error: {}", one_line(&error));
+            eprintln!("error: {}", one_line(error.as_ref()));
             match error.downcast_ref::<ControllerError>() {
                 Some(ControllerError::NoObservation { .. }) => ExitCode::from(EXIT_NO_OBSERVATION),
                 _ => ExitCode::FAILURE,
             }
         }
     }
-}
-
-/// The error and its causes, without those that the error's own text already tells.
-fn one_line(error: &anyhow::Error) -> String {
-    let mut text = String::new();
-    for cause in error.chain().map(|cause| cause.to_string().replace('\n', " ")) {
-        if !text.contains(&cause) {
-            text += if text.is_empty() { "" } else { ": " };
-            text += &cause;
-        }
-    }
-    text
 }
 
 fn open_bundle(folder: &Path) -> anyhow::Result<Bundle> {

@@ -1,7 +1,6 @@
 //! Films (GIF) and film strips (PNG).
 
-use std::fs::File;
-use std::io::{BufWriter, Cursor};
+use std::io::Cursor;
 use std::path::Path;
 
 use rcwm_models::IMAGE_SIDE;
@@ -37,12 +36,10 @@ pub(super) fn write_film(path: &Path, frames: &[Canvas], rate_hz: f64) -> Result
     let (width, height) = (side(first.width)?, side(first.height)?);
     let failed =
         |error: gif::EncodingError| RecordError::Film { path: path.to_path_buf(), reason: error.to_string() };
-    let file = File::create(path)
-        .map_err(|error| RecordError::Film { path: path.to_path_buf(), reason: error.to_string() })?;
     let shown: Vec<&Canvas> = frames.iter().step_by(every).collect();
     let mut colours = Colours::of(&shown);
-    let mut encoder =
-        gif::Encoder::new(BufWriter::new(file), width, height, &colours.palette).map_err(failed)?;
+    let mut film = Vec::new();
+    let mut encoder = gif::Encoder::new(&mut film, width, height, &colours.palette).map_err(failed)?;
     encoder.set_repeat(gif::Repeat::Infinite).map_err(failed)?;
     for frame in shown {
         let buffer = enlarge(&colours.changes(frame), frame.width, FILM_SCALE).into();
@@ -56,7 +53,9 @@ pub(super) fn write_film(path: &Path, frames: &[Canvas], rate_hz: f64) -> Result
         };
         encoder.write_frame(&frame).map_err(failed)?;
     }
-    Ok(())
+    // Its end is written when the encoder goes.
+    drop(encoder);
+    Ok(write_atomic(path, &film)?)
 }
 
 /// One palette for the whole film, and what was shown last: most of a scene stands still, and what does not change costs
@@ -147,6 +146,8 @@ pub(super) fn write_strip(path: &Path, columns: &[&[Canvas]]) -> Result<(), Reco
 
 #[cfg(test)]
 mod tests {
+    use std::fs::File;
+
     use super::*;
 
     #[test]

@@ -108,12 +108,7 @@ impl Worker {
         // Numbered in the order of recording: a simulator that was started again counts from 0 again.
         let number = self.recorded.films.len();
         let path = |ending: &str| self.folder.join(format!("episode-{number:04}.{ending}"));
-        film::write_film(&path("gif"), &running.film, self.rate_hz)?;
-        let columns: Vec<_> = film::strip_choice(running.panels.len())
-            .into_iter()
-            .map(|index| running.panels[index].as_slice())
-            .collect();
-        film::write_strip(&path("png"), &columns)?;
+        // The data before the pictures: on a full disk it is what must not be lost.
         match running.builder.finish() {
             Some(episode) if !running.broken => {
                 episode.write(&path("npz"))?;
@@ -121,6 +116,12 @@ impl Worker {
             }
             _ => self.recorded.broken_episodes += 1,
         }
+        film::write_film(&path("gif"), &running.film, self.rate_hz)?;
+        let columns: Vec<_> = film::strip_choice(running.panels.len())
+            .into_iter()
+            .map(|index| running.panels[index].as_slice())
+            .collect();
+        film::write_strip(&path("png"), &columns)?;
         self.recorded.films.push(path("gif"));
         Ok(())
     }

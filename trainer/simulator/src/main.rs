@@ -12,6 +12,7 @@ use std::time::Duration;
 use anyhow::{Context, Result};
 use clap::Parser;
 use indicatif::{ProgressBar, ProgressStyle};
+use rcwm_models::errors::one_line;
 use rcwm_models::files::write_atomic;
 use rcwm_models::tasks::{DOWNSTREAM, TASKS, UPSTREAM, task_id};
 use rcwm_models::wire::{LinkSettings, SimulatorLink};
@@ -29,7 +30,7 @@ fn main() -> ExitCode {
     match outcome {
         Ok(()) => ExitCode::SUCCESS,
         Err(error) => {
-            eprintln!("rcwm-simulator: {error:#}");
+            eprintln!("rcwm-simulator: {}", one_line(error.as_ref()));
             ExitCode::FAILURE
         }
     }
