@@ -7,6 +7,7 @@
 //! | [`learning`] | losses, gradients and updates of the world model |
 //! | [`behaviour`] | imagination with the actor, returns, actor and critic updates |
 //! | [`replay`] | experience in memory, batches drawn from it |
+//! | [`simulators`] | Meta-World processes: started, joined, recorded |
 //! | [`training`] | runs: phases, metrics, checkpoints, resuming |
 //! | [`checkpoint`] | weights and settings on disk |
 //! | [`export`] | the bundle that a runtime deploys |
@@ -22,4 +23,5 @@ pub mod model;
 pub mod ops;
 pub mod parity;
 pub mod replay;
+pub mod simulators;
 pub mod training;
