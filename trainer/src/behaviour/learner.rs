@@ -3,6 +3,7 @@ use rcwm_models::settings::ModelSettings;
 use serde::Serialize;
 
 use super::{BehaviourSettings, Imagination, ReturnRange, actor_loss, critic_loss, imagine};
+use crate::learning::parts::part;
 use crate::learning::{Adam, Gradients, LearningError, Trained};
 use crate::model::agent::Agent;
 use crate::model::latent::{Sampler, State};
@@ -84,10 +85,10 @@ impl BehaviourLearner {
     /// # Errors
     /// See [`LearningError`]; actor and critic are then as they were.
     pub fn update(&mut self, start: &State, sampler: &mut Sampler) -> Result<BehaviourUpdate, LearningError> {
-        self.mix_slow_critic()?;
+        part("slow critic", || self.mix_slow_critic())?;
         let imagined = self.imagine(start, sampler)?;
         let gradients = self.gradients(&imagined)?;
-        self.apply(&gradients)?;
+        part("behaviour Adam", || self.apply(&gradients))?;
         Ok(gradients.values)
     }
 
@@ -120,15 +121,18 @@ impl BehaviourLearner {
     /// See [`LearningError`].
     pub fn gradients(&mut self, imagined: &Imagination) -> Result<BehaviourGradients, LearningError> {
         let mut range = self.return_range;
-        range.update(&imagined.returns, &self.settings)?;
-        let actor_loss = actor_loss(imagined, range.scale(), self.settings.entropy_scale)?;
-        let critic_loss = self.critic_loss(imagined)?;
+        let actor_loss = part("actor loss", || {
+            range.update(&imagined.returns, &self.settings)?;
+            actor_loss(imagined, range.scale(), self.settings.entropy_scale)
+        })?;
+        let critic_loss = part("critic", || self.critic_loss(imagined))?;
         let of = |loss: &Tensor, trained: Trained| Gradients::of(loss, &self.parameters, trained.filter());
         let (actor, critic) = if self.settings.actor_loss_reaches_critic {
             let both = of(&(&actor_loss + &critic_loss)?, Trained::Behaviour)?;
             (both.part(Trained::Actor.filter())?, both.part(Trained::Critic.filter())?)
         } else {
-            (of(&actor_loss, Trained::Actor)?, of(&critic_loss, Trained::Critic)?)
+            let actor = part("actor backward", || of(&actor_loss, Trained::Actor))?;
+            (actor, part("critic backward", || of(&critic_loss, Trained::Critic))?)
         };
         self.return_range = range;
         let mean = |x: &Tensor| Ok::<_, candle_core::Error>(f64::from(x.mean_all()?.to_scalar::<f32>()?));

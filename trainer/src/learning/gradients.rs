@@ -4,6 +4,7 @@ use candle_core::{Tensor, backprop::GradStore};
 
 use super::LearningError;
 use crate::model::parameters::Parameters;
+use crate::ops::sum_of_squares;
 
 /// Gradients of one loss, by the parameters' names.
 #[derive(Debug, Clone)]
@@ -50,7 +51,7 @@ impl Gradients {
     pub fn new(tensors: BTreeMap<String, Tensor>) -> Result<Self, LearningError> {
         let mut squares = 0.0;
         for gradient in tensors.values() {
-            squares += f64::from(gradient.sqr()?.sum_all()?.to_scalar::<f32>()?);
+            squares += sum_of_squares(gradient)?;
         }
         let norm = squares.sqrt();
         if !norm.is_finite() {

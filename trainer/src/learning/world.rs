@@ -1,5 +1,6 @@
 use rcwm_models::settings::ModelSettings;
 
+use super::parts::part;
 use super::{
     Adam, Batch, Gradients, LearningError, LossValues, Side, Trained, WorldLosses, WorldSettings, side_of,
     world_losses,
@@ -101,8 +102,8 @@ impl WorldLearner {
     /// See [`LearningError`]; the parameters are then as they were.
     pub fn update(&mut self, batch: &Batch, sampler: &mut Sampler) -> Result<WorldUpdate, LearningError> {
         let losses = self.losses(batch, sampler)?;
-        let gradients = self.gradients(&losses)?;
-        self.apply(&gradients)?;
+        let gradients = part("world backward", || self.gradients(&losses))?;
+        part("world Adam", || self.apply(&gradients))?;
         Ok(WorldUpdate {
             losses: losses.values()?,
             gradient_norm: gradients.norm(),

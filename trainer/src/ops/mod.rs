@@ -37,7 +37,7 @@ mod check;
 mod oracle_tests;
 
 pub use activation::{log_softmax, sigmoid, softmax};
-pub use adam::{Adam, AdamSettings, AdamState};
+pub use adam::{AdamStep, adam_step, sum_of_squares};
 pub use attention::cross_attention;
 pub use categorical::{
     KlBalance, balanced_kl, entropy, log_probs, one_hot_of_best, probs, straight_through_mode,

@@ -17,6 +17,7 @@ pub(super) struct Updates {
 
 struct WorldStep {
     losses: WorldLosses,
+    free_nats: f64,
     gradients: Gradients,
     updated: Parameters,
 }
@@ -37,7 +38,7 @@ impl Updates {
         learner.apply(&resolved(reference, &gradients, device)?)?;
         // The behaviour's update has the original weights, its own copy of them.
         let start = losses.observed.posteriors.map(|x| x.detach().flatten(0, 1))?; // [B*T, ...]
-        let world = WorldStep { losses, gradients, updated };
+        let world = WorldStep { losses, free_nats: settings.free_nats, gradients, updated };
 
         let updated = parameters(reference, device)?;
         let mut learner =
@@ -91,8 +92,10 @@ impl Updates {
         }
         for (branch, kl) in ["robot", "environment"].into_iter().zip(&losses.branches) {
             named.push((format!("{branch}_kl"), kl.kl.clone()));
-            named.push((format!("{branch}_dynamics"), kl.dynamics.mean_all()?.reshape(1)?));
-            named.push((format!("{branch}_representation"), kl.representation.mean_all()?.reshape(1)?));
+            // The halves differ in their gradients only.
+            let clipped = kl.kl.maximum(self.world.free_nats)?.mean_all()?.reshape(1)?;
+            named.push((format!("{branch}_dynamics"), clipped.clone()));
+            named.push((format!("{branch}_representation"), clipped));
         }
         Ok(named)
     }
