@@ -44,7 +44,8 @@ pub struct Report {
 }
 
 /// Parts that belong to the world model's update; the others are the behaviour's.
-const WORLD: [&str; 6] = ["encode", "observe", "decode", "other losses", "world backward", "world Adam"];
+const WORLD: [&str; 7] =
+    ["encode", "observe", "decode", "other losses", "world backward", "world sum", "world Adam"];
 
 impl Report {
     pub fn new(case: &Case, times: &Times) -> Result<Self> {

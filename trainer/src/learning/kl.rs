@@ -14,6 +14,19 @@ pub struct BranchKl {
     pub loss: Tensor,
 }
 
+impl BranchKl {
+    /// Without gradient.
+    pub(super) fn detached(&self) -> Self {
+        Self { kl: self.kl.detach(), loss: self.loss.detach() }
+    }
+
+    /// Rows after rows.
+    pub(super) fn cat<'a>(shares: impl Iterator<Item = &'a Self>) -> Result<Self> {
+        let (kl, loss): (Vec<_>, Vec<_>) = shares.map(|share| (&share.kl, &share.loss)).unzip();
+        Ok(Self { kl: Tensor::cat(&kl, 0)?, loss: Tensor::cat(&loss, 0)? })
+    }
+}
+
 /// The balanced KL between a branch's posterior q and prior p (eq. 3), from their logits [B, T, n, m].
 ///
 /// # Errors

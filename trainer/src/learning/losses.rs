@@ -108,6 +108,49 @@ fn continue_loss(logit: &Tensor, terminal: &Tensor) -> Result<Tensor> {
 }
 
 impl WorldLosses {
+    /// The same without gradient, which lets go of the graph.
+    #[must_use]
+    pub fn detached(&self) -> Self {
+        Self {
+            image: self.image.detach(),
+            robot_mask: self.robot_mask.as_ref().map(Tensor::detach),
+            reward: self.reward.detach(),
+            continues: self.continues.detach(),
+            branches: self.branches.iter().map(BranchKl::detached).collect(),
+            total: self.total.detach(),
+            observed: self.observed.detached(),
+        }
+    }
+
+    /// The losses of a batch from those of shares of its rows, each with its share of the rows.
+    ///
+    /// # Errors
+    /// Those of candle.
+    pub fn merged(shares: &[(f64, Self)]) -> Result<Self> {
+        if let [(_, all)] = shares {
+            return Ok(all.clone());
+        }
+        let sum = |scalar: fn(&Self) -> Option<&Tensor>| -> Result<Option<Tensor>> {
+            let terms = shares.iter().filter_map(|(weight, losses)| scalar(losses).map(|x| x * *weight));
+            terms.reduce(|a, b| a? + b?).transpose()
+        };
+        let all =
+            |scalar| sum(scalar)?.ok_or_else(|| candle_core::Error::Msg("losses of no rows".to_owned()));
+        let observed: Vec<_> = shares.iter().map(|(_, losses)| &losses.observed).collect();
+        let branch = |index: usize| BranchKl::cat(shares.iter().map(|(_, losses)| &losses.branches[index]));
+        Ok(Self {
+            image: all(|losses| Some(&losses.image))?,
+            robot_mask: sum(|losses| losses.robot_mask.as_ref())?,
+            reward: all(|losses| Some(&losses.reward))?,
+            continues: all(|losses| Some(&losses.continues))?,
+            branches: (0..shares.first().map_or(0, |(_, losses)| losses.branches.len()))
+                .map(branch)
+                .collect::<Result<_>>()?,
+            total: all(|losses| Some(&losses.total))?,
+            observed: Observed::cat(&observed)?,
+        })
+    }
+
     /// The plain numbers.
     ///
     /// # Errors

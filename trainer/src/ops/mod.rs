@@ -25,6 +25,7 @@ mod conv_stack;
 mod kernels;
 mod linear;
 mod node;
+mod noise;
 mod norm;
 mod painted;
 mod picture;
@@ -46,8 +47,9 @@ pub use categorical::{
 pub use cell::{recurrent_cell, recurrent_update};
 pub use conv::{conv_down, conv_down_stack, conv_up, conv_up_stack};
 pub use conv_stack::ConvLayer;
-pub use kernels::parallel::leave_threads_to_ops;
+pub use kernels::parallel::{in_parallel, leave_threads_to_ops, shares_of};
 pub use linear::linear;
+pub use noise::{gumbel, normal};
 pub use norm::{layer_norm, layer_norm_silu};
 pub use painted::painted_loss;
 pub use picture::{image_to_float, picture_loss};

@@ -33,8 +33,7 @@ impl Updates {
         let updated = parameters(reference, device)?;
         let settings = WorldSettings { reward_scale: reference.reward_scale, ..WorldSettings::default() };
         let mut learner = WorldLearner::new(&updated, &reference.settings, &settings, Trained::World)?;
-        let losses = learner.losses(&batch, &mut Sampler::Mode)?;
-        let gradients = learner.gradients(&losses)?;
+        let (losses, gradients) = learner.gradients(&batch, &mut Sampler::Mode)?;
         learner.apply(&resolved(reference, &gradients, device)?)?;
         // The behaviour's update has the original weights, its own copy of them.
         let start = losses.observed.posteriors.map(|x| x.detach().flatten(0, 1))?; // [B*T, ...]
@@ -44,8 +43,8 @@ impl Updates {
         let mut learner =
             BehaviourLearner::new(&updated, &reference.settings, &behaviour_settings(reference))?;
         learner.mix_slow_critic()?;
-        let imagined = learner.imagine(&start, &mut Sampler::Mode)?;
-        let gradients = learner.gradients(&imagined)?;
+        let imagined = learner.imagine_shares(&start, &mut Sampler::Mode)?;
+        let gradients = learner.gradients(imagined)?;
         learner.apply(&gradients)?;
         Ok(Self { world, behaviour: BehaviourStep { gradients, updated } })
     }
