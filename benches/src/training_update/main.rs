@@ -66,6 +66,7 @@ struct Results {
 
 fn main() -> ExitCode {
     rcwm_trainer::ops::leave_threads_to_ops();
+    rcwm_trainer::ops::keep_freed_memory();
     match run(&Arguments::parse()) {
         Ok(()) => ExitCode::SUCCESS,
         Err(error) => {
