@@ -18,7 +18,7 @@ use report::Report;
 
 /// Measures one training update of the RCWM and of actor and critic, by part.
 ///
-/// Experience is made up; everything else is what training does. After every update a square product is timed, whose rate is the peak
+/// Experience is made up; everything else is what training does. After every update a product is timed, whose rate is the peak
 /// that the parts are compared with.
 #[derive(Debug, Parser)]
 #[command(

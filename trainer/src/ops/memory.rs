@@ -19,3 +19,12 @@ pub fn keep_freed_memory() {
         }
     }
 }
+
+/// Gives what was freed and kept back to the system once.
+pub fn return_freed_memory() {
+    #[cfg(all(target_os = "linux", target_env = "gnu"))]
+    // SAFETY: `malloc_trim` touches free memory only, and takes the allocator's locks.
+    unsafe {
+        libc::malloc_trim(0)
+    };
+}

@@ -50,7 +50,7 @@ pub use conv::{conv_down, conv_down_stack, conv_up, conv_up_stack};
 pub use conv_stack::ConvLayer;
 pub use kernels::parallel::{in_parallel, leave_threads_to_ops, shares_of};
 pub use linear::linear;
-pub use memory::keep_freed_memory;
+pub use memory::{keep_freed_memory, return_freed_memory};
 pub use noise::{gumbel, normal};
 pub use norm::{layer_norm, layer_norm_silu};
 pub use painted::painted_loss;
