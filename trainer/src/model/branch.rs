@@ -32,6 +32,9 @@ pub struct Branch {
     cell_norm: Norm,
     prior: LatentHead,
     posterior: LatentHead,
+    /// Columns of the posterior's dense block for h and for the embedding. Cut once: in a scan, the gradients of all steps are summed before
+    /// they are put into place.
+    posterior_columns: [Tensor; 2],
     initial: Tensor,
     categoricals: usize,
     classes: usize,
@@ -47,12 +50,14 @@ impl Branch {
         let (d, hidden) = (settings.deter, settings.hidden);
         let cell = scope.at("cell");
         let init = Init::TruncatedNormal { fans: hidden + d + 3 * d };
+        let posterior = LatentHead::new(&scope.at("posterior"), d + embed, settings)?;
         Ok(Self {
             input: Dense::new(&scope.at("input"), input, hidden)?,
             cell_weight: cell.at("linear").get("weight", &[3 * d, hidden + d], init)?,
             cell_norm: Norm::new(&cell.at("norm"), 3 * d, NORM_EPS)?,
             prior: LatentHead::new(&scope.at("prior"), d, settings)?,
-            posterior: LatentHead::new(&scope.at("posterior"), d + embed, settings)?,
+            posterior_columns: [posterior.dense.columns(0, d)?, posterior.dense.columns(d, embed)?],
+            posterior,
             initial: scope.get("initial", &[1, d], Init::Zeros)?,
             categoricals: settings.categoricals,
             classes: settings.classes,
@@ -100,7 +105,7 @@ impl Branch {
     /// # Errors
     /// Those of candle.
     pub fn embed_share(&self, embed: &Tensor) -> Result<Tensor> {
-        self.posterior.dense.partial(embed, self.initial.dim(1)?)
+        ops::linear(embed, &self.posterior_columns[1], None)
     }
 
     /// Logits of the posterior `q(z_t | h_t, o_t)`: `h` [..., d] and the image's share [..., hidden] to [..., n, m].
@@ -108,7 +113,8 @@ impl Branch {
     /// # Errors
     /// Those of candle.
     pub fn posterior_logits(&self, h: &Tensor, embed_share: &Tensor) -> Result<Tensor> {
-        let hidden = self.posterior.dense.finish(&(self.posterior.dense.partial(h, 0)? + embed_share)?)?;
+        let sum = (ops::linear(h, &self.posterior_columns[0], None)? + embed_share)?;
+        let hidden = self.posterior.dense.finish(&sum)?;
         self.to_latent_shape(&self.posterior.logits.forward(&hidden)?)
     }
 

@@ -118,17 +118,16 @@ impl Dense {
         self.norm.silu(&ops::linear(x, &self.weight, None)?)
     }
 
-    /// The share that columns `[from, from + width)` of the input have in the sum before the normalisation: parts of an input
-    /// that are known early can be multiplied early, and for many steps at once.
+    /// Weights [out, width] of columns `[from, from + width)` of the input, by which they have their share in the sum before the
+    /// normalisation: parts of an input that are known early can be multiplied early, and for many steps at once.
     ///
     /// # Errors
     /// Those of candle.
-    pub fn partial(&self, x: &Tensor, from: usize) -> Result<Tensor> {
-        let width = x.dim(candle_core::D::Minus1)?;
-        ops::linear(x, &self.weight.narrow(1, from, width)?, None)
+    pub fn columns(&self, from: usize, width: usize) -> Result<Tensor> {
+        self.weight.narrow(1, from, width)
     }
 
-    /// The block's output from the summed shares of [`Dense::partial`].
+    /// The block's output from the summed shares of [`Dense::columns`].
     ///
     /// # Errors
     /// Those of candle.
