@@ -7,6 +7,7 @@
 //! | [`learning`] | losses, gradients and updates of the world model |
 //! | [`behaviour`] | imagination with the actor, returns, actor and critic updates |
 //! | [`replay`] | experience in memory, batches drawn from it |
+//! | [`simulators`] | Meta-World processes: started, joined, recorded |
 //! | [`training`] | runs: phases, metrics, checkpoints, resuming |
 //! | [`checkpoint`] | weights and settings on disk |
 //! | [`export`] | the bundle that a runtime deploys |
@@ -26,4 +27,5 @@ pub mod ops;
 pub mod parity;
 pub mod plots;
 pub mod replay;
+pub mod simulators;
 pub mod training;

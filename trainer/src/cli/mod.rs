@@ -1,5 +1,6 @@
 //! The command line, one file per verb.
 
+mod collect;
 mod export;
 mod init;
 mod parameters;
@@ -8,6 +9,8 @@ mod pretrain;
 
 use std::path::Path;
 use std::process::ExitCode;
+use std::sync::Arc;
+use std::sync::atomic::{AtomicBool, Ordering};
 
 use anyhow::{Context, Result};
 use candle_core::Device;
@@ -24,6 +27,7 @@ pub struct Arguments {
 
 #[derive(Debug, Subcommand)]
 enum Verb {
+    Collect(collect::Collect),
     Parameters(parameters::Parameters),
     Parity(parity::Parity),
     Init(init::Init),
@@ -35,6 +39,7 @@ impl Arguments {
     /// Runs the verb.
     pub fn run(self) -> Result<ExitCode> {
         match self.verb {
+            Verb::Collect(verb) => verb.run(),
             Verb::Parameters(verb) => verb.run(),
             Verb::Parity(verb) => verb.run(),
             Verb::Init(verb) => verb.run(),
@@ -127,6 +132,20 @@ fn parse_device(text: &str) -> Result<Device> {
         }
         _ => anyhow::bail!("--device {text}: expected cpu, cuda or cuda:N"),
     }
+}
+
+/// Set by the first Ctrl-C; the second one ends the program at once.
+fn stop_on_ctrl_c() -> Result<Arc<AtomicBool>> {
+    let stop = Arc::new(AtomicBool::new(false));
+    let heard = Arc::clone(&stop);
+    ctrlc::set_handler(move || {
+        // The second one no longer waits for the checkpoint.
+        if heard.swap(true, Ordering::Relaxed) {
+            std::process::exit(130);
+        }
+    })
+    .context("Ctrl-C could not be caught")?;
+    Ok(stop)
 }
 
 /// Writes what a verb measured as JSON.

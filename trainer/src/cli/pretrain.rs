@@ -1,7 +1,5 @@
 use std::path::{Path, PathBuf};
 use std::process::ExitCode;
-use std::sync::Arc;
-use std::sync::atomic::{AtomicBool, Ordering};
 
 use anyhow::{Context, Result};
 use indicatif::{ProgressBar, ProgressStyle};
@@ -51,7 +49,7 @@ pub struct Pretrain {
 impl Pretrain {
     pub fn run(self) -> Result<ExitCode> {
         let device = super::parse_device(&self.device)?;
-        let stop = stop_on_ctrl_c()?;
+        let stop = super::stop_on_ctrl_c()?;
         let settings = self.settings()?;
         settings.validate()?;
         if !self.resume && self.out.join("settings.toml").exists() {
@@ -100,19 +98,6 @@ impl Pretrain {
 /// A run may be resumed from another folder.
 fn absolute(path: &Path) -> Result<PathBuf> {
     std::path::absolute(path).with_context(|| format!("{}", path.display()))
-}
-
-fn stop_on_ctrl_c() -> Result<Arc<AtomicBool>> {
-    let stop = Arc::new(AtomicBool::new(false));
-    let heard = Arc::clone(&stop);
-    ctrlc::set_handler(move || {
-        // The second one no longer waits for the checkpoint.
-        if heard.swap(true, Ordering::Relaxed) {
-            std::process::exit(130);
-        }
-    })
-    .context("Ctrl-C could not be caught")?;
-    Ok(stop)
 }
 
 fn load(settings: &TrainingSettings) -> Result<Replay> {

@@ -1,0 +1,93 @@
+use std::sync::atomic::{AtomicBool, Ordering};
+use std::time::Duration;
+
+use rcwm_models::ACTION_LEN;
+use rcwm_models::wire::{
+    Action, ActionSource, ControllerLink, LinkError, LinkSettings, ObservationSample, Wait,
+};
+
+use super::{ProcessError, SimulatorProcess};
+
+/// The longest single wait, so that a stop or a dead simulator is noticed.
+const WAIT_SLICE: Duration = Duration::from_millis(100);
+
+/// Why talking to a simulator failed.
+#[derive(Debug, thiserror::Error)]
+pub enum ClientError {
+    /// The link.
+    #[error(transparent)]
+    Link(#[from] LinkError),
+    /// The simulator's process.
+    #[error(transparent)]
+    Process(#[from] ProcessError),
+}
+
+/// The trainer's end of a link in lock-step: every observation once, however often it was published.
+pub struct Client {
+    link: ControllerLink,
+    /// `None` where the simulator was running before.
+    process: Option<SimulatorProcess>,
+    /// The newest answer, sent again if it was lost.
+    answer: Option<Action>,
+}
+
+impl Client {
+    /// Connects to the simulator that was started.
+    ///
+    /// # Errors
+    /// See [`LinkError`].
+    pub fn of(process: SimulatorProcess) -> Result<Self, ClientError> {
+        let link = ControllerLink::open(LinkSettings::new(process.instance()))?;
+        Ok(Self { link, process: Some(process), answer: None })
+    }
+
+    /// Connects to a simulator that runs, or will.
+    ///
+    /// # Errors
+    /// See [`LinkError`].
+    pub fn join(instance: &str) -> Result<Self, ClientError> {
+        Ok(Self { link: ControllerLink::open(LinkSettings::new(instance))?, process: None, answer: None })
+    }
+
+    /// The next observation; `None` when the simulator is done or `stop` was set.
+    ///
+    /// # Errors
+    /// See [`ClientError`]; a simulator that died is reported with its last words.
+    pub fn next(&mut self, stop: &AtomicBool) -> Result<Option<ObservationSample>, ClientError> {
+        while !stop.load(Ordering::Relaxed) {
+            match self.link.wait_observation(WAIT_SLICE)? {
+                Wait::Message(observation) => match self.answer {
+                    Some(answer) if answer.answers == observation.sequence => {
+                        self.link.send(answer)?;
+                    }
+                    _ => return Ok(Some(observation)),
+                },
+                // It may have said goodbye before this end was connected.
+                Wait::TimedOut if !self.is_running()? => return Ok(None),
+                Wait::TimedOut => {}
+                Wait::Closed => {
+                    self.is_running()?;
+                    return Ok(None);
+                }
+            }
+        }
+        Ok(None)
+    }
+
+    /// Nothing is known of a simulator that was joined: it counts as running.
+    fn is_running(&mut self) -> Result<bool, ClientError> {
+        Ok(self.process.as_mut().map_or(Ok(true), SimulatorProcess::is_running)?)
+    }
+
+    /// Answers the observation of this sequence.
+    ///
+    /// # Errors
+    /// [`LinkError::Traffic`].
+    pub fn answer(&mut self, sequence: u64, action: [f32; ACTION_LEN]) -> Result<(), ClientError> {
+        let source = ActionSource::Policy as u32;
+        let answer = Action { answers: sequence, published_ns: 0, source, reserved: 0, action };
+        self.link.send(answer)?;
+        self.answer = Some(answer);
+        Ok(())
+    }
+}

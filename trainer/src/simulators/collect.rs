@@ -1,0 +1,228 @@
+use std::collections::BTreeMap;
+use std::path::{Path, PathBuf};
+use std::sync::Mutex;
+use std::sync::atomic::{AtomicBool, Ordering};
+use std::time::Duration;
+
+use rand::{Rng, SeedableRng};
+use rand_chacha::ChaCha8Rng;
+use rcwm_models::ACTION_LEN;
+use rcwm_models::episode::{Episode, EpisodeError};
+use rcwm_models::tasks::task_name;
+use serde::Serialize;
+
+use super::recorder::{Recorded, Recorder};
+use super::{Client, ClientError, Job, Launch, Plan, SimulatorProcess};
+
+/// A simulator whose trainer is gone ends by itself after so long.
+const SILENCE_MAX: Duration = Duration::from_secs(60);
+
+/// Why collecting failed.
+#[derive(Debug, thiserror::Error)]
+pub enum CollectError {
+    /// A simulator.
+    #[error(transparent)]
+    Client(#[from] ClientError),
+    /// An episode could not be put together or written.
+    #[error(transparent)]
+    Episode(#[from] EpisodeError),
+    /// A folder could not be made.
+    #[error("{path}: {source}")]
+    Folder {
+        /// The folder.
+        path: PathBuf,
+        /// What the operating system said.
+        source: std::io::Error,
+    },
+}
+
+impl From<super::ProcessError> for CollectError {
+    fn from(error: super::ProcessError) -> Self {
+        Self::Client(error.into())
+    }
+}
+
+/// How to collect.
+#[derive(Debug, Clone)]
+pub struct CollectSettings {
+    /// Folder of the data.
+    pub out: PathBuf,
+    /// Seed of layouts and scripted decisions.
+    pub seed: u64,
+    /// Simulators at a time.
+    pub simulators: usize,
+    /// Decisions in an episode.
+    pub steps_max: u32,
+    /// Visual disturbance: `none`, `textures` or `noise`.
+    pub disturb: String,
+}
+
+/// What was collected, by task and script.
+#[derive(Debug, Clone, Default, PartialEq, Serialize)]
+pub struct Collected {
+    /// Episodes.
+    pub episodes: u64,
+    /// Steps: decisions, the first observation of an episode not counted.
+    pub steps: u64,
+    /// Episodes in which the task was solved at some step.
+    pub successes: u64,
+    /// Episodes with masks.
+    pub masked: u64,
+    /// Sum of all rewards.
+    pub reward_sum: f64,
+}
+
+/// Sums by task and script.
+pub type Sums = BTreeMap<(String, String), Collected>;
+
+impl Collected {
+    fn add(&mut self, episode: &Episode) {
+        self.episodes += 1;
+        self.steps += episode.len().saturating_sub(1) as u64;
+        self.successes += u64::from(episode.succeeded());
+        self.masked += u64::from(episode.robot_mask.is_some());
+        self.reward_sum += episode.total_reward();
+    }
+}
+
+/// Progress of a collection.
+#[derive(Debug, Clone, Copy)]
+pub enum Seen {
+    /// A step of an episode.
+    Step,
+    /// A whole episode was written.
+    Episode,
+}
+
+/// Records the episodes of a plan with `settings.simulators` processes at a time. Whole episodes only are written, so that a collection
+/// that was cut off goes on where it was.
+///
+/// # Errors
+/// See [`CollectError`]: of the first simulator that fails; the others end after their present step.
+pub fn collect(
+    plan: &Plan,
+    settings: &CollectSettings,
+    stop: &AtomicBool,
+    seen: &(dyn Fn(Seen) + Sync),
+) -> Result<Sums, CollectError> {
+    let queue = Mutex::new(plan.jobs.iter());
+    let failed = AtomicBool::new(false);
+    let worker = |number: usize| -> Result<Sums, CollectError> {
+        let mut sums = Sums::new();
+        let mut run = 0;
+        // The lock is held for the taking only.
+        let take = || queue.lock().ok().and_then(|mut jobs| jobs.next());
+        while let (false, Some(job)) = (ended(stop, &failed), take()) {
+            let instance = format!("collect-{}-{number}-{run}", std::process::id());
+            run += 1;
+            if let Err(error) = run_job(job, &instance, settings, stop, seen, &mut sums) {
+                failed.store(true, Ordering::Relaxed);
+                return Err(error);
+            }
+        }
+        Ok(sums)
+    };
+    let results: Vec<_> = std::thread::scope(|scope| {
+        let workers: Vec<_> =
+            (0..settings.simulators.max(1)).map(|number| scope.spawn(move || worker(number))).collect();
+        workers.into_iter().map(|worker| worker.join().expect("workers do not panic")).collect()
+    });
+    let mut total = Sums::new();
+    for sums in results {
+        for (key, part) in sums? {
+            total.entry(key).or_default().merge(&part);
+        }
+    }
+    Ok(total)
+}
+
+impl Collected {
+    fn merge(&mut self, other: &Self) {
+        self.episodes += other.episodes;
+        self.steps += other.steps;
+        self.successes += other.successes;
+        self.masked += other.masked;
+        self.reward_sum += other.reward_sum;
+    }
+}
+
+fn ended(stop: &AtomicBool, failed: &AtomicBool) -> bool {
+    stop.load(Ordering::Relaxed) || failed.load(Ordering::Relaxed)
+}
+
+fn run_job(
+    job: &Job,
+    instance: &str,
+    settings: &CollectSettings,
+    stop: &AtomicBool,
+    seen: &(dyn Fn(Seen) + Sync),
+    sums: &mut Sums,
+) -> Result<(), CollectError> {
+    make_folder(&settings.out.join(&job.task))?;
+    let process = SimulatorProcess::start(&Launch {
+        task: job.task.clone(),
+        instance: instance.to_owned(),
+        seed: settings.seed,
+        first_episode: job.first_number(),
+        episodes: job.episodes,
+        steps_max: settings.steps_max,
+        policy: job.script.name(),
+        masks: job.masks,
+        disturb: settings.disturb.clone(),
+        silence_max: SILENCE_MAX,
+    })?;
+    let mut recorder = Recorder::new(Client::of(process)?);
+    // The simulator decides by itself: an answer is a receipt.
+    while let Some(Recorded { number, episode, .. }) =
+        recorder.episode(stop, || [0.0; ACTION_LEN], || seen(Seen::Step))?
+    {
+        episode.write(&job.file(&settings.out, settings.seed, number))?;
+        sums.entry((job.task.clone(), job.script.name().to_owned())).or_default().add(&episode);
+        seen(Seen::Episode);
+    }
+    Ok(())
+}
+
+/// Records episodes of a simulator that runs already, until `episodes` were seen or it ends. Every observation is answered by a
+/// random action: a scripted simulator takes it as a receipt, one that waits for a policy executes it.
+///
+/// # Errors
+/// See [`CollectError`].
+pub fn record(
+    instance: &str,
+    episodes: u64,
+    out: &Path,
+    seed: u64,
+    stop: &AtomicBool,
+    seen: &(dyn Fn(Seen) + Sync),
+) -> Result<Sums, CollectError> {
+    let mut random = ChaCha8Rng::seed_from_u64(seed);
+    let mut recorder = Recorder::new(Client::join(instance)?);
+    let mut sums = Sums::new();
+    for _ in 0..episodes {
+        let decide = || std::array::from_fn(|_| random.random_range(-1.0..=1.0));
+        let recorded = recorder.episode(stop, decide, || seen(Seen::Step))?;
+        let Some(Recorded { number, task, episode }) = recorded else { break };
+        let folder = out.join(task_name(task));
+        make_folder(&folder)?;
+        episode.write(&free_name(&folder, instance, number))?;
+        sums.entry((task_name(task).to_owned(), instance.to_owned())).or_default().add(&episode);
+        seen(Seen::Episode);
+    }
+    Ok(sums)
+}
+
+/// A name that is not taken: numbers begin anew with every simulator.
+fn free_name(folder: &Path, instance: &str, number: u64) -> PathBuf {
+    (0_u32..)
+        .map(|again| {
+            let suffix = if again == 0 { String::new() } else { format!("-{again}") };
+            folder.join(format!("{instance}-{number:05}{suffix}.npz"))
+        })
+        .find(|path| !path.exists())
+        .unwrap_or_else(|| folder.join(format!("{instance}-{number:05}.npz")))
+}
+
+fn make_folder(path: &Path) -> Result<(), CollectError> {
+    std::fs::create_dir_all(path).map_err(|source| CollectError::Folder { path: path.to_path_buf(), source })
+}
