@@ -12,8 +12,10 @@
 //! | `robot_dynamics` | a model on the trajectories of a task |
 //! | `report` | means, spreads and intervals; the table and the plots |
 //! | `statistics` | bootstrap over episodes, Wilson's interval |
+//! | `closed_loop` | success rate of the exported policy, by simulators and runtimes |
 //! | `film` | what was imagined, as a strip and animated |
 
+mod closed_loop;
 mod film;
 mod measures;
 mod open_loop;
@@ -22,6 +24,7 @@ mod robot_dynamics;
 mod statistics;
 mod trajectories;
 
+pub use closed_loop::{ClosedLoopError, ClosedLoopReport, ClosedLoopSettings, Position, closed_loop};
 pub use film::Film;
 pub use measures::{Measure, Trace, traces};
 pub use open_loop::{filtered, imagined, joined, open_loop};
@@ -38,17 +41,19 @@ use crate::replay::ReplayError;
 pub enum EvaluationError {
     /// There is nothing to measure on.
     #[error(
-        "{task}: none of {episodes} episodes has robot masks and at least {length} steps; collect some with masks, or ask for \
-         fewer steps"
+        "{task}: none of {episodes} masked episodes has the {length} steps of a trajectory; imagine fewer, or collect longer ones"
     )]
     NoTrajectories {
         /// The task.
         task: String,
-        /// Its episodes.
+        /// Its episodes with masks.
         episodes: usize,
         /// Steps of a trajectory.
         length: usize,
     },
+    /// No episode has masks.
+    #[error("none of the episodes has robot masks; collect some with masks (rcwm-trainer collect --masks)")]
+    NoMasks,
     /// It was stopped.
     #[error("interrupted; nothing was written")]
     Interrupted,

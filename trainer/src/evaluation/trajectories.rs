@@ -37,15 +37,19 @@ impl TaskTrajectories {
     /// each, at starts drawn by `seed` of which none comes twice. Where episodes are few and short there may be fewer than `count`.
     ///
     /// # Errors
-    /// [`EvaluationError::NoTrajectories`] if a task has no masked episode of this length.
+    /// [`EvaluationError::NoMasks`], or [`EvaluationError::NoTrajectories`] if a task's masked episodes are too short.
     pub fn choose(
         replay: &Replay,
         count: usize,
         length: usize,
         seed: u64,
     ) -> Result<Vec<Self>, EvaluationError> {
+        let replay = replay.masked();
+        if replay.episodes() == 0 {
+            return Err(EvaluationError::NoMasks);
+        }
         let of = |(task, episodes): (&str, Vec<&Arc<Episode>>)| {
-            let fits = |episode: &&&Arc<Episode>| episode.robot_mask.is_some() && episode.len() >= length;
+            let fits = |episode: &&&Arc<Episode>| episode.len() >= length;
             let fitting: Vec<_> = episodes.iter().filter(fits).copied().collect();
             if fitting.is_empty() {
                 let task = task.to_owned();
