@@ -12,7 +12,7 @@ use crate::simulators::{ProcessError, Program, RunningProgram};
 
 /// A simulator or runtime whose other side is gone ends by itself after so many seconds.
 const SILENCE_S: &str = "120";
-/// How long a runtime may take to end after its simulator.
+/// How long one side may run without the other.
 const GRACE: Duration = Duration::from_secs(30);
 /// Between two looks at the processes.
 const LOOK: Duration = Duration::from_millis(50);
@@ -26,7 +26,7 @@ pub enum ClosedLoopError {
     #[error(transparent)]
     Process(#[from] ProcessError),
     /// A runtime left its simulator alone.
-    #[error("rcwm-runtime of {instance:?} ended before its simulator did; run both by hand to see why")]
+    #[error("rcwm-runtime of {instance:?} ended long before its simulator did; run both by hand to see why")]
     Left {
         /// Their link.
         instance: String,
@@ -249,8 +249,8 @@ struct Pair {
     instance: String,
     first_episode: u64,
     position: Position,
-    /// Since when the simulator has ended.
-    closed: Option<Instant>,
+    /// Since when one side runs without the other.
+    alone: Option<Instant>,
     served: PathBuf,
     ran: PathBuf,
 }
@@ -292,17 +292,7 @@ impl Pair {
             .arg(&ran);
         let runtime = RunningProgram::start(Program::RUNTIME, &instance, command)?;
         let position = Position::default();
-        Ok(Self {
-            observer,
-            simulator,
-            runtime,
-            instance,
-            first_episode,
-            position,
-            closed: None,
-            served,
-            ran,
-        })
+        Ok(Self { observer, simulator, runtime, instance, first_episode, position, alone: None, served, ran })
     }
 
     /// Whether either side still runs.
@@ -311,17 +301,17 @@ impl Pair {
             let episodes = observation.episode.saturating_sub(self.first_episode);
             self.position = Position { episodes, steps: observation.step };
         }
-        let instance = || self.instance.clone();
         let (serves, controls) = (self.simulator.is_running()?, self.runtime.is_running()?);
-        // It may have ended between the two looks.
-        if serves && !controls && self.simulator.is_running()? {
-            return Err(ClosedLoopError::Left { instance: instance() });
-        }
-        if !serves {
-            let closed = *self.closed.get_or_insert_with(Instant::now);
-            if controls && closed.elapsed() > GRACE {
-                return Err(ClosedLoopError::Hangs { instance: instance() });
-            }
+        // Who has said goodbye may need a while to end.
+        if serves == controls {
+            self.alone = None;
+        } else if self.alone.get_or_insert_with(Instant::now).elapsed() > GRACE {
+            let instance = self.instance.clone();
+            return Err(if serves {
+                ClosedLoopError::Left { instance }
+            } else {
+                ClosedLoopError::Hangs { instance }
+            });
         }
         Ok(serves || controls)
     }

@@ -47,6 +47,27 @@ impl Measure {
         }
     }
 
+    /// How it is computed, exactly.
+    #[must_use]
+    pub const fn definition(self) -> &'static str {
+        match self {
+            Self::RobotError => {
+                "sum over pixels and channels of (imagined - true)^2 * true robot mask, divided by 64*64*3; pictures in [0, 1], whole \
+                 picture of the model, not clipped"
+            }
+            Self::RobotErrorOnRobot => {
+                "the same sum divided by 3 times the true mask's pixels; steps without robot left out"
+            }
+            Self::MaskIou => {
+                "intersection over union of the robot branch's mask above 0.5 and the true mask; steps where both are empty left out"
+            }
+            Self::ReconstructionError => {
+                "mean over 64*64*3 values of (imagined - true)^2; pictures in [0, 1], not clipped"
+            }
+            Self::RewardError => "absolute difference of the expected reward and the recorded one",
+        }
+    }
+
     /// What it is, in words.
     #[must_use]
     pub const fn title(self) -> &'static str {

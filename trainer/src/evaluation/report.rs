@@ -166,7 +166,7 @@ impl OpenLoopReport {
     /// A report without models yet.
     #[must_use]
     pub fn new(settings: OpenLoopSettings) -> Self {
-        let measures = Measure::ALL.iter().map(|measure| (measure.name(), measure.title())).collect();
+        let measures = Measure::ALL.iter().map(|measure| (measure.name(), measure.definition())).collect();
         Self { settings, measures, models: Vec::new(), comparisons: Vec::new() }
     }
 

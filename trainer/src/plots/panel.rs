@@ -110,7 +110,7 @@ impl Panel {
         if self.lines.iter().filter(|line| !line.faint).count() > 1 {
             chart
                 .configure_series_labels()
-                .position(SeriesLabelPosition::UpperRight)
+                .position(self.free_corner(x_range))
                 .background_style(WHITE.mix(0.8))
                 .border_style(BLACK.mix(0.15))
                 .legend_area_size(18)
@@ -183,6 +183,24 @@ impl Panel {
         }
         chart.draw_series(dots)?;
         Ok(())
+    }
+
+    /// The upper corner that the lines are further away from.
+    fn free_corner(&self, (left, right): (f64, f64)) -> SeriesLabelPosition {
+        let middle = (left + right) / 2.0;
+        let highest = |on_left: bool| {
+            let here = self
+                .lines
+                .iter()
+                .flat_map(|line| self.places(line))
+                .filter(|(x, _)| (*x < middle) == on_left);
+            here.map(|(_, y)| y).fold(f64::NEG_INFINITY, f64::max)
+        };
+        if highest(true) < highest(false) {
+            SeriesLabelPosition::UpperLeft
+        } else {
+            SeriesLabelPosition::UpperRight
+        }
     }
 
     /// The points that have a place on the axes.
