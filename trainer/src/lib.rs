@@ -12,16 +12,20 @@
 //! | [`checkpoint`] | weights and settings on disk |
 //! | [`export`] | the bundle that a runtime deploys |
 //! | [`parity`] | our numbers against the authors' |
+//! | [`evaluation`] | what a model can do: open loop, robot dynamics, success |
+//! | [`plots`] | charts, films and text as pictures |
 //!
 //! This crate never depends on tract or pyo3.
 
 pub mod behaviour;
 pub mod checkpoint;
+pub mod evaluation;
 pub mod export;
 pub mod learning;
 pub mod model;
 pub mod ops;
 pub mod parity;
+pub mod plots;
 pub mod replay;
 pub mod simulators;
 pub mod training;

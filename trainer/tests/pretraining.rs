@@ -13,7 +13,7 @@ use rcwm_models::settings::{ModelKind, Preset};
 use rcwm_trainer::checkpoint::Checkpoint;
 use rcwm_trainer::model::parameters::Parameters;
 use rcwm_trainer::replay::Replay;
-use rcwm_trainer::training::{Outcome, Pretraining, Run, TrainingError, TrainingSettings};
+use rcwm_trainer::training::{Outcome, Pretraining, Progress, Run, TrainingError, TrainingSettings};
 
 /// A bright square, the robot, that moves over a dark ground with the action.
 fn episode(steps: usize, shift: usize, masked: bool) -> Episode {
@@ -65,11 +65,25 @@ fn bits(parameters: &Parameters) -> Vec<(String, Vec<u32>)> {
     parameters.iter().map(|(name, var)| (name.to_owned(), bits(var))).collect()
 }
 
-fn updates_logged(folder: &Path) -> Vec<u64> {
+/// The lines of metrics: those of updates, or those on held-out episodes.
+fn lines(folder: &Path, held_out: bool) -> Vec<serde_json::Value> {
     let text = fs::read_to_string(folder.join("metrics.jsonl")).unwrap();
-    let update =
-        |line: &str| serde_json::from_str::<serde_json::Value>(line).unwrap()["update"].as_u64().unwrap();
-    text.lines().map(update).collect()
+    let lines = text.lines().map(|line| serde_json::from_str::<serde_json::Value>(line).unwrap());
+    lines.filter(|line| line.get("held_out").is_some() == held_out).collect()
+}
+
+fn updates(lines: &[serde_json::Value]) -> Vec<u64> {
+    lines.iter().map(|line| line["update"].as_u64().unwrap()).collect()
+}
+
+fn updates_logged(folder: &Path) -> Vec<u64> {
+    updates(&lines(folder, false))
+}
+
+fn event_files(folder: &Path) -> usize {
+    let name = |entry: fs::DirEntry| entry.file_name().to_string_lossy().into_owned();
+    let names = fs::read_dir(folder).unwrap().map(|entry| name(entry.unwrap()));
+    names.filter(|name| name.contains("tfevents")).count()
 }
 
 #[test]
@@ -90,6 +104,10 @@ fn a_resumed_run_gives_the_same_weights_as_one_that_never_stopped() {
         train(&mut second);
         assert!(bits(second.parameters()) == expected, "{kind:?}: not the same bits");
         assert_eq!(updates_logged(&halves), updates_logged(&whole));
+        assert_eq!(updates(&lines(&whole, true)), [5, 10, 12]);
+        let newest = |folder| lines(folder, true).last().unwrap()["held_out"].clone();
+        assert_eq!(newest(&halves), newest(&whole), "the same weights are judged the same");
+        assert_eq!((event_files(&whole), event_files(&halves)), (1, 2));
         let stored = Checkpoint::read(&Run::last(&halves), &Device::Cpu).unwrap();
         assert!(bits(&stored.parameters) == expected);
     }
@@ -129,7 +147,9 @@ fn a_stopped_run_is_saved_where_it_was() {
     assert_eq!(stored.settings.updates, 7);
     assert!(folder.path().join("checkpoints/best/checkpoint.toml").exists());
     let files = fs::read_dir(Run::last(folder.path())).unwrap().count();
-    assert!(folder.path().join("films/000007-reach.png").exists());
+    for file in ["films/000007-reach.png", "films/hammer.gif", "curves.png"] {
+        assert!(folder.path().join(file).exists(), "{file}");
+    }
     assert_eq!(files, 3, "checkpoint.toml, one file of weights, one of the optimiser");
 }
 
@@ -160,4 +180,27 @@ fn a_run_is_neither_overwritten_nor_resumed_where_there_is_none_or_with_another_
     assert!(matches!(again, Err(TrainingError::Exists { .. })));
     let other = Pretraining::resume(folder.path(), settings(ModelKind::Vanilla, 1), &Device::Cpu);
     assert!(matches!(other, Err(TrainingError::OtherModel)));
+}
+
+#[test]
+fn the_best_checkpoint_has_the_lowest_loss_on_episodes_that_are_not_trained_on() {
+    let folder = tempfile::tempdir().unwrap();
+    let mut settings = settings(ModelKind::Rcwm, 20);
+    settings.world.adam.learning_rate = 1e-3;
+    let mut training = Pretraining::create(folder.path(), settings.clone(), &Device::Cpu).unwrap();
+    let mut seen = Vec::new();
+    let show = |progress: &Progress<'_>| seen.extend(progress.held_out.cloned());
+    training.run(replay(), &AtomicBool::new(false), show).unwrap();
+    assert_eq!(seen.iter().map(|line| line.update).collect::<Vec<_>>(), [5, 10, 15, 20]);
+    let best = seen.iter().min_by(|a, b| a.held_out.total.total_cmp(&b.held_out.total)).unwrap();
+    assert!(best.best && best.held_out.total < seen[0].held_out.total);
+    let stored = Checkpoint::read(&folder.path().join("checkpoints/best"), &Device::Cpu).unwrap();
+    assert_eq!(stored.settings.updates, best.update);
+
+    let without = folder.path().join("without");
+    settings.replay.held_out_episodes = 0;
+    let mut training = Pretraining::create(&without, settings, &Device::Cpu).unwrap();
+    train(&mut training);
+    assert!(lines(&without, true).is_empty());
+    assert!(without.join("checkpoints/best/checkpoint.toml").exists(), "the training loss decides");
 }

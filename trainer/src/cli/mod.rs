@@ -1,6 +1,7 @@
 //! The command line, one file per verb.
 
 mod collect;
+mod evaluate;
 mod export;
 mod init;
 mod parameters;
@@ -32,6 +33,7 @@ enum Verb {
     Parity(parity::Parity),
     Init(init::Init),
     Export(export::Export),
+    Evaluate(evaluate::Evaluate),
     Pretrain(pretrain::Pretrain),
 }
 
@@ -44,6 +46,7 @@ impl Arguments {
             Verb::Parity(verb) => verb.run(),
             Verb::Init(verb) => verb.run(),
             Verb::Export(verb) => verb.run(),
+            Verb::Evaluate(verb) => verb.run(),
             Verb::Pretrain(verb) => verb.run(),
         }
     }

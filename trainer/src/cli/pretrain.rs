@@ -5,7 +5,9 @@ use anyhow::{Context, Result};
 use indicatif::{ProgressBar, ProgressStyle};
 use rcwm_models::settings;
 use rcwm_trainer::replay::{Folder, Replay};
-use rcwm_trainer::training::{Metrics, Pretraining, Progress, Run, TrainingError, TrainingSettings};
+use rcwm_trainer::training::{
+    HeldOutLosses, Metrics, Pretraining, Progress, Run, TrainingError, TrainingSettings,
+};
 
 /// Train a world model on recorded episodes: mask warm-up, then mask-free
 #[derive(Debug, clap::Args)]
@@ -14,7 +16,8 @@ use rcwm_trainer::training::{Metrics, Pretraining, Progress, Run, TrainingError,
   rcwm-trainer pretrain --preset small --model vanilla --data data/upstream --out runs/vanilla --set replay.batch=4
   rcwm-trainer pretrain --out runs/small --resume --set pretrain.updates=40000
 
-Every setting and its value is in settings.toml of the run's folder. RAYON_NUM_THREADS sets the number of threads; with the same
+Every setting and its value is in settings.toml of the run's folder; curves.png there and TensorBoard (tensorboard --logdir runs)
+show how it goes. replay.held_out_episodes of each task are not trained on: the best checkpoint is chosen by them. RAYON_NUM_THREADS sets the number of threads; with the same
 number a resumed run gives the same weights, bit for bit, as one that was never interrupted.")]
 pub struct Pretrain {
     /// Sizes to start from
@@ -128,6 +131,13 @@ fn progress_bar(settings: &TrainingSettings, done: u64) -> ProgressBar {
 
 fn show(bar: &ProgressBar, progress: &Progress<'_>) {
     bar.set_position(progress.updates);
+    if let Some(HeldOutLosses { update, held_out, best }) = progress.held_out {
+        let best = if *best { ", the best so far" } else { "" };
+        bar.println(format!(
+            "{update} updates: held-out loss {:.1}, image {:.1}{best}",
+            held_out.total, held_out.image
+        ));
+    }
     if let Some(metrics) = progress.metrics {
         bar.set_message(describe(metrics));
     }

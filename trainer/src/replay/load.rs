@@ -107,7 +107,20 @@ impl Folder {
     ///
     /// # Errors
     /// See [`LoadError`].
-    pub fn load(&self, capacity: usize, mut seen: impl FnMut()) -> Result<Replay, LoadError> {
+    pub fn load(&self, capacity: usize, seen: impl FnMut()) -> Result<Replay, LoadError> {
+        self.load_where(|_| true, capacity, seen)
+    }
+
+    /// The same of those episodes only that `keep` keeps.
+    ///
+    /// # Errors
+    /// See [`LoadError`].
+    pub fn load_where(
+        &self,
+        keep: impl Fn(&Episode) -> bool,
+        capacity: usize,
+        mut seen: impl FnMut(),
+    ) -> Result<Replay, LoadError> {
         let mut replay = Replay::new(capacity);
         for (task, path) in &self.files {
             let mut episode = Episode::read(path)?;
@@ -117,7 +130,10 @@ impl Folder {
                     episode.robot_mask = Some(read_masks(&folder, episode.len())?);
                 }
             }
-            replay.add(task, episode).map_err(|source| LoadError::Refused { path: path.clone(), source })?;
+            if keep(&episode) {
+                let refused = |source| LoadError::Refused { path: path.clone(), source };
+                replay.add(task, episode).map_err(refused)?;
+            }
             seen();
         }
         Ok(replay)

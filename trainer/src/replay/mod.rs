@@ -11,10 +11,11 @@
 //! masks/reach/000017/00000.png, 00001.png, ...   optional: masks that a segmenter wrote, one a step, white the robot
 //! ```
 
+mod held_out;
 mod load;
 mod prefetch;
 mod store;
 
 pub use load::{Folder, LoadError};
 pub use prefetch::{Prefetch, PrefetchError};
-pub use store::{Replay, ReplayError};
+pub use store::{Replay, ReplayError, append_steps};

@@ -55,25 +55,25 @@ pub enum ReplayError {
 
 /// An episode and when it came.
 #[derive(Debug, Clone)]
-struct Stored {
-    episode: Arc<Episode>,
+pub(super) struct Stored {
+    pub(super) episode: Arc<Episode>,
     number: u64,
 }
 
 /// One task's episodes, oldest first.
 #[derive(Debug, Clone, Default)]
-struct Task {
-    episodes: VecDeque<Stored>,
-    steps: usize,
+pub(super) struct Task {
+    pub(super) episodes: VecDeque<Stored>,
+    pub(super) steps: usize,
 }
 
 /// Episodes by task, up to a number of steps; the oldest go first.
 #[derive(Debug, Clone)]
 pub struct Replay {
-    tasks: BTreeMap<String, Task>,
-    capacity: usize,
-    steps: usize,
-    next_number: u64,
+    pub(super) tasks: BTreeMap<String, Task>,
+    pub(super) capacity: usize,
+    pub(super) steps: usize,
+    pub(super) next_number: u64,
 }
 
 impl Replay {
@@ -212,7 +212,11 @@ impl Task {
     }
 }
 
-fn append_steps(
+/// Appends steps `from` to `from + count` of an episode of the task `name` to a batch.
+///
+/// # Errors
+/// [`ReplayError::NoMasks`] if `masks` are wanted and there are none.
+pub fn append_steps(
     name: &str,
     episode: &Episode,
     from: usize,

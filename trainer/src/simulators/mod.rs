@@ -9,4 +9,4 @@ mod recorder;
 pub use client::{Client, ClientError};
 pub use collect::{CollectError, CollectSettings, Collected, Seen, Sums, collect, record};
 pub use plan::{Amounts, Job, Plan, Script};
-pub use process::{Launch, ProcessError, Program, SimulatorProcess};
+pub use process::{Launch, ProcessError, Program, RunningProgram, SimulatorProcess};

@@ -146,11 +146,7 @@ const _: () = assert!((STEPS_PER_EPISODE as usize) < STEPS_MAX);
 
 /// A running simulator; it is ended when this is dropped.
 #[derive(Debug)]
-pub struct SimulatorProcess {
-    child: Child,
-    instance: String,
-    words: Option<File>,
-}
+pub struct SimulatorProcess(RunningProgram);
 
 impl SimulatorProcess {
     /// Starts a simulator in lock-step.
@@ -158,11 +154,7 @@ impl SimulatorProcess {
     /// # Errors
     /// [`ProcessError::Missing`] or [`ProcessError::Start`].
     pub fn start(launch: &Launch) -> Result<Self, ProcessError> {
-        let path = Program::SIMULATOR.find()?;
-        let fail = |source| ProcessError::Start { path: path.clone(), source };
-        // A file, not a pipe: a pipe that nobody reads would stop it one day.
-        let words = tempfile::tempfile().map_err(fail)?;
-        let mut command = Command::new(&path);
+        let mut command = Command::new(Program::SIMULATOR.find()?);
         command
             .args(["serve", "--pace", "lockstep", "--task", &launch.task, "--instance", &launch.instance])
             .args(["--policy", launch.policy, "--disturb", &launch.disturb])
@@ -171,19 +163,14 @@ impl SimulatorProcess {
             .args(["--episodes", &launch.episodes.to_string()])
             .args(["--steps-max", &launch.steps_max.to_string()])
             .args(["--wait-controller", &launch.silence_max.as_secs().to_string()])
-            .args(launch.masks.then_some("--masks"))
-            .stdin(Stdio::null())
-            .stdout(Stdio::null())
-            .stderr(words.try_clone().map_err(fail)?);
-        in_own_group(&mut command);
-        let child = command.spawn().map_err(fail)?;
-        Ok(Self { child, instance: launch.instance.clone(), words: Some(words) })
+            .args(launch.masks.then_some("--masks"));
+        RunningProgram::start(Program::SIMULATOR, &launch.instance, command).map(Self)
     }
 
     /// Name of its link.
     #[must_use]
     pub fn instance(&self) -> &str {
-        &self.instance
+        &self.0.instance
     }
 
     /// Whether it still runs; otherwise it has ended well.
@@ -191,16 +178,51 @@ impl SimulatorProcess {
     /// # Errors
     /// [`ProcessError::Ended`] with its last words if it failed.
     pub fn is_running(&mut self) -> Result<bool, ProcessError> {
-        let name = Program::SIMULATOR.name;
+        self.0.is_running()
+    }
+}
+
+/// A running program of this project; it is ended when this is dropped.
+#[derive(Debug)]
+pub struct RunningProgram {
+    child: Child,
+    name: &'static str,
+    instance: String,
+    words: File,
+}
+
+impl RunningProgram {
+    /// Starts a command of `program` on the link `instance`; what it says is kept for its last words.
+    ///
+    /// # Errors
+    /// [`ProcessError::Start`].
+    pub fn start(program: Program, instance: &str, mut command: Command) -> Result<Self, ProcessError> {
+        let path = PathBuf::from(command.get_program());
+        let fail = |source| ProcessError::Start { path: path.clone(), source };
+        // A file, not a pipe: a pipe that nobody reads would stop it one day.
+        let words = tempfile::tempfile().map_err(fail)?;
+        command.stdin(Stdio::null()).stdout(Stdio::null()).stderr(words.try_clone().map_err(fail)?);
+        in_own_group(&mut command);
+        let child = command.spawn().map_err(fail)?;
+        Ok(Self { child, name: program.name, instance: instance.to_owned(), words })
+    }
+
+    /// Whether it still runs; otherwise it has ended well.
+    ///
+    /// # Errors
+    /// [`ProcessError::Ended`] with its last words if it failed.
+    pub fn is_running(&mut self) -> Result<bool, ProcessError> {
         match self.child.try_wait() {
             Ok(Some(status)) if !status.success() => Err(ProcessError::Ended {
-                name,
+                name: self.name,
                 instance: self.instance.clone(),
                 status,
                 last_words: self.last_words(),
             }),
             Ok(status) => Ok(status.is_none()),
-            Err(source) => Err(ProcessError::Wait { name, instance: self.instance.clone(), source }),
+            Err(source) => {
+                Err(ProcessError::Wait { name: self.name, instance: self.instance.clone(), source })
+            }
         }
     }
 
@@ -212,7 +234,7 @@ impl SimulatorProcess {
             file.take(LAST_WORDS_BYTES).read_to_end(&mut bytes)?;
             Ok(String::from_utf8_lossy(&bytes).into_owned())
         };
-        let text = self.words.as_mut().and_then(|file| read(file).ok()).unwrap_or_default();
+        let text = read(&mut self.words).unwrap_or_default();
         text.lines().rev().find(|line| !line.trim().is_empty()).unwrap_or("it said nothing").trim().to_owned()
     }
 
@@ -238,7 +260,7 @@ fn in_own_group(command: &mut Command) {
     command.process_group(0);
 }
 
-impl Drop for SimulatorProcess {
+impl Drop for RunningProgram {
     fn drop(&mut self) {
         if self.is_gone() {
             return;

@@ -4,10 +4,14 @@
 //!
 //! ```text
 //! settings.toml        everything that was chosen, resolved; --resume goes on from it
-//! metrics.jsonl        one line for every `metrics_every` updates: the truth
+//! metrics.jsonl        one line for every `metrics_every` updates, one on the held-out episodes for every checkpoint: the truth
+//! events.out.tfevents  the same numbers for TensorBoard; a resumed run begins another file
+//! curves.png           the same numbers as curves, drawn anew with every checkpoint
 //! checkpoints/last/    weights, settings and the optimiser's state; the newest
-//! films/               000500-reach.png: what the model imagines of one episode a task, with every checkpoint
-//! checkpoints/best/    the one with the lowest mask-free loss over an interval between checkpoints
+//! checkpoints/best/    the one with the lowest loss on the held-out episodes; where there are none, with the lowest mask-free loss
+//!                      over an interval between checkpoints
+//! films/               what the model imagines of one (held-out) episode a task: 000500-reach.png with every checkpoint, and animated
+//!                      reach.gif of the newest
 //! ```
 //!
 //! Every draw is numbered by its update, so the state of a run is: weights, moments of the optimiser, number of updates. A run
@@ -18,24 +22,34 @@
 //! | `settings` | what can be chosen, presets |
 //! | `state` | what a checkpoint holds beside the weights |
 //! | `run` | the folder: settings, metrics, checkpoints |
-//! | `film` | film strips of the open loop |
+//! | `metrics` | what a line of metrics says |
+//! | `tensorboard` | event files |
+//! | `curves` | the metrics as a picture |
+//! | `film` | films of the open loop |
+//! | `held_out` | the loss on episodes that are not trained on |
 //! | `pretrain` | the phase: mask warm-up, then mask-free updates |
 
+mod curves;
 mod film;
+mod held_out;
+mod metrics;
 mod pretrain;
 mod run;
 mod settings;
 mod state;
+mod tensorboard;
 
-pub use film::{FilmSettings, film_strip, write_png};
+pub use film::{FilmSettings, film};
+pub use metrics::{HeldOutLosses, Metrics};
 pub use pretrain::{Outcome, Pretraining, Progress};
-pub use run::{Metrics, Run};
+pub use run::{Best, Run};
 pub use settings::{PretrainSettings, ReplaySettings, TrainingSettings};
 pub use state::{StateError, TrainingState};
 
 use crate::checkpoint::CheckpointError;
 use crate::learning::LearningError;
 use crate::model::parameters::ParameterError;
+use crate::plots::PlotError;
 use crate::replay::{LoadError, PrefetchError, ReplayError};
 use rcwm_models::files::FileError;
 use rcwm_models::settings::SettingsError;
@@ -102,6 +116,9 @@ pub enum TrainingError {
     /// No batch came.
     #[error(transparent)]
     Prefetch(#[from] PrefetchError),
+    /// A film or the curves could not be drawn or written.
+    #[error(transparent)]
+    Plot(#[from] PlotError),
     /// A tensor operation failed.
     #[error(transparent)]
     Tensor(#[from] candle_core::Error),

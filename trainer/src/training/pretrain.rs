@@ -6,7 +6,8 @@ use std::time::Instant;
 use candle_core::Device;
 use rcwm_models::episode::Episode;
 
-use super::{Metrics, Run, TrainingError, TrainingSettings, TrainingState, film_strip, write_png};
+use super::held_out::{HeldOut, mean_losses};
+use super::{Best, HeldOutLosses, Metrics, Run, TrainingError, TrainingSettings, TrainingState, film};
 use crate::learning::{LossValues, Trained, WorldLearner, WorldUpdate};
 use crate::model::agent::{self, Agent};
 use crate::model::latent::Sampler;
@@ -17,9 +18,6 @@ use crate::replay::{Prefetch, Replay};
 const WORLD: &str = "world";
 /// What sets the replay's stream of draws apart from the sampler's under the same seed.
 const REPLAY_STREAM: u64 = 0x7265_706c_6179;
-
-/// A task and an episode of it to make films of.
-type Scene = (String, Arc<Episode>);
 
 /// Pre-training of the world model (spec: phases 2): masked warm-up, then mask-free updates.
 #[derive(Debug)]
@@ -41,6 +39,8 @@ pub struct Progress<'a> {
     pub metrics: Option<&'a Metrics>,
     /// Whether a checkpoint was just saved.
     pub saved: bool,
+    /// What the checkpoint gives on the held-out episodes, if one was saved and there are any.
+    pub held_out: Option<&'a HeldOutLosses>,
 }
 
 /// How a run ended.
@@ -118,7 +118,8 @@ impl Pretraining {
         stop: &AtomicBool,
         mut show: impl FnMut(&Progress<'_>),
     ) -> Result<Outcome, TrainingError> {
-        let scenes = self.scenes(&replay);
+        let (replay, held_out) = replay.hold_out(self.settings.replay.held_out_episodes);
+        let judge = Judge::new(&self.settings, &replay, held_out);
         let mut batches = self.prefetch(replay)?;
         let mut interval = Interval::begin(&batches);
         let mut since_checkpoint = Means::default();
@@ -138,14 +139,19 @@ impl Pretraining {
                 self.run.log(metrics)?;
             }
             let saved = self.state.updates.is_multiple_of(self.settings.checkpoint_every);
+            let mut losses = None;
             if saved {
-                self.save(std::mem::take(&mut since_checkpoint), &scenes)?;
+                let begin = Instant::now();
+                losses = self.save(std::mem::take(&mut since_checkpoint), &judge)?;
+                // Updates a second are those of training.
+                interval.begin += begin.elapsed();
                 saved_at = Some(self.state.updates);
             }
-            show(&Progress { updates: self.state.updates, metrics: metrics.as_ref(), saved });
+            let (updates, held_out) = (self.state.updates, losses.as_ref());
+            show(&Progress { updates, metrics: metrics.as_ref(), saved, held_out });
         }
         if saved_at != Some(self.state.updates) {
-            self.save(since_checkpoint, &scenes)?;
+            self.save(since_checkpoint, &judge)?;
         }
         let interrupted = self.state.updates < self.settings.pretrain.updates;
         Ok(Outcome { updates: self.state.updates, interrupted })
@@ -162,36 +168,64 @@ impl Pretraining {
         })?)
     }
 
-    /// Saves a checkpoint; it is the best if the mask-free updates since the last one had the lowest mean loss so far.
-    fn save(&mut self, since: Means, scenes: &[Scene]) -> Result<(), TrainingError> {
-        let loss = since.mask_free_loss();
-        let is_best = match (loss, self.state.best_loss) {
-            (Some(loss), Some(best)) => loss < best,
-            (loss, None) => loss.is_some(),
-            (None, Some(_)) => false,
+    /// Saves a checkpoint, then judges it, draws the curves and makes films.
+    fn save(&mut self, since: Means, judge: &Judge) -> Result<Option<HeldOutLosses>, TrainingError> {
+        let agent = Agent::new(&self.parameters.frozen(), &self.settings.model)?;
+        let (sizes, world) = (&self.settings.replay, &self.settings.world);
+        let held_out = judge.held_out.losses(&agent, sizes, world, &self.device)?;
+        let best = match &held_out {
+            Some(losses) => lower(Some(losses.total), &mut self.state.best_held_out_loss),
+            None => lower(since.mask_free_loss(), &mut self.state.best_loss),
         };
-        if is_best {
-            self.state.best_loss = loss;
+        let update = self.state.updates;
+        let line = held_out.map(|held_out| HeldOutLosses { update, held_out, best: best == Best::Yes });
+        // Before the checkpoint: who dies in between loses both, because a resumed run drops lines beyond its checkpoint.
+        if let Some(line) = &line {
+            self.run.log_held_out(line)?;
         }
         let optimisers = [(WORLD, self.learner.adam())];
-        self.run.save(&self.parameters, &self.settings, &self.state, &optimisers, is_best)?;
-        let agent = Agent::new(&self.parameters.frozen(), &self.settings.model)?;
-        for (task, episode) in scenes {
-            let strip = film_strip(&agent, episode, &self.settings.film, &self.device)?;
-            write_png(&strip, &self.run.film(self.state.updates, task)?)?;
+        self.run.save(&self.parameters, &self.settings, &self.state, &optimisers, best)?;
+        self.run.draw_curves(self.settings.pretrain.warm_up_updates)?;
+        for (task, episode) in &judge.scenes {
+            let settings = &self.settings.film;
+            let film = film(&agent, episode, settings, &self.device)?;
+            let films = self.run.films()?;
+            film.write_strip(settings.every, &films.join(format!("{update:06}-{task}.png")))?;
+            film.write_gif(&films.join(format!("{task}.gif")))?;
         }
-        Ok(())
+        Ok(line)
     }
+}
 
-    /// The first episode of every task that is long enough to imagine some of.
-    fn scenes(&self, replay: &Replay) -> Vec<Scene> {
-        let film = &self.settings.film;
-        let long = |episode: &&Arc<Episode>| film.length > 0 && episode.len() > film.context;
-        let first = |(task, episodes): (&str, Vec<&Arc<Episode>>)| {
-            let episode = episodes.into_iter().find(long)?;
-            Some((task.to_owned(), Arc::clone(episode)))
-        };
-        replay.tasks().filter_map(first).collect()
+/// What checkpoints are judged by.
+#[derive(Debug)]
+struct Judge {
+    held_out: HeldOut,
+    scenes: Vec<(String, Arc<Episode>)>,
+}
+
+impl Judge {
+    /// Films are of held-out episodes; of a task without one, of an episode that is trained on.
+    fn new(settings: &TrainingSettings, replay: &Replay, held_out: Replay) -> Self {
+        let mut scenes = settings.film.scenes(&held_out);
+        for (task, episode) in settings.film.scenes(replay) {
+            if scenes.iter().all(|(other, _)| *other != task) {
+                scenes.push((task, episode));
+            }
+        }
+        Self { held_out: HeldOut::new(held_out, settings.seed), scenes }
+    }
+}
+
+/// Whether `loss` is lower than the lowest so far, which then follows.
+fn lower(loss: Option<f64>, lowest: &mut Option<f64>) -> Best {
+    match (loss, *lowest) {
+        (None, _) => Best::No,
+        (Some(loss), Some(before)) if loss >= before => Best::No,
+        (Some(_), _) => {
+            *lowest = loss;
+            Best::Yes
+        }
     }
 }
 
@@ -210,14 +244,11 @@ impl Means {
         self.losses.push((update.losses, update.gradient_norm));
     }
 
-    fn mean(&self, value: impl Fn(&LossValues) -> Option<f64>) -> Option<f64> {
-        let values: Vec<f64> = self.losses.iter().filter_map(|(losses, _)| value(losses)).collect();
-        (!values.is_empty()).then(|| values.iter().sum::<f64>() / values.len() as f64)
-    }
-
     /// Mean of the total loss over updates without masks.
     fn mask_free_loss(&self) -> Option<f64> {
-        self.mean(|losses| losses.robot_mask.is_none().then_some(losses.total))
+        let mask_free = self.losses.iter().filter(|(losses, _)| losses.robot_mask.is_none());
+        let totals: Vec<f64> = mask_free.map(|(losses, _)| losses.total).collect();
+        (!totals.is_empty()).then(|| totals.iter().sum::<f64>() / totals.len() as f64)
     }
 }
 
@@ -238,20 +269,11 @@ impl Interval {
     fn metrics(self, update: u64, phase: &'static str, batches: &Prefetch) -> Metrics {
         let seconds = self.begin.elapsed().as_secs_f64().max(1e-9);
         let count = self.means.losses.len() as f64;
-        let mean =
-            |value: fn(&LossValues) -> f64| self.means.mean(|losses| Some(value(losses))).unwrap_or_default();
+        let losses: Vec<LossValues> = self.means.losses.iter().map(|(losses, _)| *losses).collect();
         Metrics {
             update,
             phase,
-            losses: LossValues {
-                total: mean(|losses| losses.total),
-                image: mean(|losses| losses.image),
-                robot_mask: self.means.mean(|losses| losses.robot_mask),
-                reward: mean(|losses| losses.reward),
-                continues: mean(|losses| losses.continues),
-                robot_kl: mean(|losses| losses.robot_kl),
-                environment_kl: self.means.mean(|losses| losses.environment_kl),
-            },
+            losses: mean_losses(&losses),
             gradient_norm: self.means.losses.iter().map(|(_, norm)| norm).sum::<f64>() / count.max(1.0),
             updates_per_second: count / seconds,
             waiting_share: (batches.waited().as_secs_f64() - self.waited_before_s) / seconds,

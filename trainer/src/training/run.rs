@@ -6,38 +6,33 @@ use candle_core::Device;
 use rcwm_models::files::{read_capped, write_atomic};
 use serde::{Deserialize, Serialize};
 
-use super::{TrainingError, TrainingSettings, TrainingState};
+use super::tensorboard::EventFile;
+use super::{HeldOutLosses, Metrics, TrainingError, TrainingSettings, TrainingState, curves};
 use crate::checkpoint::{self, Checkpoint, CheckpointSettings};
-use crate::learning::{Adam, LossValues};
+use crate::learning::Adam;
 use crate::model::parameters::Parameters;
 
 const SETTINGS_FILE: &str = "settings.toml";
 const METRICS_FILE: &str = "metrics.jsonl";
+const CURVES_FILE: &str = "curves.png";
 /// Largest file of metrics that is read back, in bytes.
-const METRICS_BYTES_MAX: u64 = 1 << 30;
-
-/// One line of metrics: means over the updates since the line before.
-#[derive(Debug, Clone, PartialEq, Serialize)]
-pub struct Metrics {
-    /// Updates made so far.
-    pub update: u64,
-    /// `warm_up` or `mask_free`.
-    pub phase: &'static str,
-    /// The losses before their factors.
-    pub losses: LossValues,
-    /// Norm of the gradients before clipping.
-    pub gradient_norm: f64,
-    /// Updates a second.
-    pub updates_per_second: f64,
-    /// Share of the time spent waiting for batches.
-    pub waiting_share: f64,
-}
+pub(super) const METRICS_BYTES_MAX: u64 = 1 << 30;
 
 /// A run's folder.
 #[derive(Debug)]
 pub struct Run {
     folder: PathBuf,
     metrics: File,
+    events: EventFile,
+}
+
+/// Whether a checkpoint is the best one so far, and so is kept apart from the newest.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum Best {
+    /// It is.
+    Yes,
+    /// It is not.
+    No,
 }
 
 impl Run {
@@ -51,7 +46,7 @@ impl Run {
         }
         fs::create_dir_all(folder).map_err(failed(folder))?;
         write_atomic(&folder.join(METRICS_FILE), b"")?;
-        Self::open(folder, settings)
+        Self::open(folder, settings, 0)
     }
 
     /// Goes on with a run: metrics beyond `updates` belong to updates that were lost, and are dropped.
@@ -73,18 +68,20 @@ impl Run {
                 kept.push('\n');
             }
         }
-        for place in [folder, &folder.join("checkpoints/last"), &folder.join("checkpoints/best")] {
-            remove_unfinished(place).map_err(failed(place))?;
+        for place in ["", "checkpoints/last", "checkpoints/best", "films"].map(|place| folder.join(place)) {
+            remove_unfinished(&place).map_err(failed(&place))?;
         }
         write_atomic(&path, kept.as_bytes())?;
-        Self::open(folder, settings)
+        Self::open(folder, settings, updates + 1)
     }
 
-    fn open(folder: &Path, settings: &TrainingSettings) -> Result<Self, TrainingError> {
+    /// `first_update` is the one that this process makes first where it goes on, else 0.
+    fn open(folder: &Path, settings: &TrainingSettings, first_update: u64) -> Result<Self, TrainingError> {
         write_atomic(&folder.join(SETTINGS_FILE), toml::to_string(settings)?.as_bytes())?;
         let path = folder.join(METRICS_FILE);
         let metrics = OpenOptions::new().append(true).open(&path).map_err(failed(&path))?;
-        Ok(Self { folder: folder.to_path_buf(), metrics })
+        let events = EventFile::begin(folder, first_update).map_err(failed(folder))?;
+        Ok(Self { folder: folder.to_path_buf(), metrics, events })
     }
 
     /// The settings of the run in `folder`.
@@ -116,19 +113,45 @@ impl Run {
     /// # Errors
     /// Those of writing.
     pub fn log(&mut self, metrics: &Metrics) -> Result<(), TrainingError> {
-        let mut line = serde_json::to_vec(metrics)?;
-        line.push(b'\n');
-        self.metrics.write_all(&line).map_err(failed(&self.folder.join(METRICS_FILE)))
+        self.append(metrics, metrics.update, &metrics.scalars())
     }
 
-    /// Where the film strip of a task at this update goes; the folder is made.
+    /// Appends a line on the held-out episodes.
+    ///
+    /// # Errors
+    /// Those of writing.
+    pub fn log_held_out(&mut self, losses: &HeldOutLosses) -> Result<(), TrainingError> {
+        self.append(losses, losses.update, &losses.scalars())
+    }
+
+    fn append(
+        &mut self,
+        line: &impl Serialize,
+        update: u64,
+        scalars: &[(String, f64)],
+    ) -> Result<(), TrainingError> {
+        let mut line = serde_json::to_vec(line)?;
+        line.push(b'\n');
+        self.metrics.write_all(&line).map_err(failed(&self.folder.join(METRICS_FILE)))?;
+        self.events.scalars(update, scalars).map_err(failed(self.events.path()))
+    }
+
+    /// Draws the curves of everything that was logged.
+    ///
+    /// # Errors
+    /// Those of drawing and writing.
+    pub fn draw_curves(&self, warm_up_updates: u64) -> Result<(), TrainingError> {
+        curves::write(&self.folder.join(METRICS_FILE), &self.folder.join(CURVES_FILE), warm_up_updates)
+    }
+
+    /// Where films go; the folder is made.
     ///
     /// # Errors
     /// Those of making it.
-    pub fn film(&self, updates: u64, task: &str) -> Result<PathBuf, TrainingError> {
+    pub fn films(&self) -> Result<PathBuf, TrainingError> {
         let films = self.folder.join("films");
         fs::create_dir_all(&films).map_err(failed(&films))?;
-        Ok(films.join(format!("{updates:06}-{task}.png")))
+        Ok(films)
     }
 
     /// Saves a checkpoint as the newest one, and as the best if it is. The state is written before the weights that it goes with,
@@ -142,7 +165,7 @@ impl Run {
         settings: &TrainingSettings,
         state: &TrainingState,
         optimisers: &[(&str, &Adam)],
-        is_best: bool,
+        best: Best,
     ) -> Result<(), TrainingError> {
         let checkpoint = Checkpoint {
             settings: CheckpointSettings {
@@ -156,7 +179,7 @@ impl Run {
             },
             parameters: parameters.clone(),
         };
-        if is_best {
+        if best == Best::Yes {
             checkpoint.write(&self.folder.join("checkpoints").join("best"))?;
         }
         let last = Self::last(&self.folder);

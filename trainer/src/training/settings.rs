@@ -65,12 +65,24 @@ pub struct ReplaySettings {
     pub length: usize,
     /// Batches drawn ahead of their use.
     pub prefetch: usize,
+    /// Episodes of each task that are not trained on: the best checkpoint is chosen by them, and films are of them.
+    /// Never more than half of a task's; 0 holds none out.
+    pub held_out_episodes: usize,
+    /// Batches of them that a checkpoint is judged by, the same for every checkpoint.
+    pub held_out_batches: usize,
 }
 
 impl Default for ReplaySettings {
     /// The paper's (Table 2), for pre-training.
     fn default() -> Self {
-        Self { capacity_steps: 2_000_000, batch: 16, length: 64, prefetch: 4 }
+        Self {
+            capacity_steps: 2_000_000,
+            batch: 16,
+            length: 64,
+            prefetch: 4,
+            held_out_episodes: 2,
+            held_out_batches: 4,
+        }
     }
 }
 
@@ -136,6 +148,7 @@ impl TrainingSettings {
             ("replay.batch", replay.batch, 1),
             ("replay.length", replay.length, 2),
             ("replay.prefetch", replay.prefetch, 1),
+            ("replay.held_out_batches", replay.held_out_batches, 1),
             ("replay.capacity_steps", replay.capacity_steps, replay.length),
             ("behaviour.horizon.length", self.behaviour.horizon.length, 2),
         ] {

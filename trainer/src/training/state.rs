@@ -63,6 +63,9 @@ pub struct TrainingState {
     pub updates: u64,
     /// Lowest mask-free loss over an interval between checkpoints; none before the first.
     pub best_loss: Option<f64>,
+    /// Lowest loss on the held-out episodes; none before the first, or where none are held out.
+    #[serde(default)]
+    pub best_held_out_loss: Option<f64>,
     /// The returns' average range.
     pub return_range: ReturnRange,
     /// Steps of every parameter's optimiser, by optimiser and name.

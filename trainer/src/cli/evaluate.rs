@@ -1,0 +1,344 @@
+use std::path::{Path, PathBuf};
+use std::process::ExitCode;
+use std::sync::atomic::{AtomicBool, Ordering};
+use std::time::Duration;
+
+use anyhow::{Context, Result, ensure};
+use candle_core::Device;
+use indicatif::{ProgressBar, ProgressStyle};
+use rcwm_models::bundle::PartName;
+use rcwm_models::tasks::task_id;
+use rcwm_trainer::checkpoint::Checkpoint;
+use rcwm_trainer::evaluation::{
+    ClosedLoopReport, ClosedLoopSettings, Comparison, Latents, Measure, Measured, ModelReport,
+    OpenLoopReport, OpenLoopSettings, Position, TaskReport, TaskTrajectories, closed_loop, measure,
+};
+use rcwm_trainer::export::{self, ExportError, Options};
+use rcwm_trainer::model::agent::Agent;
+use rcwm_trainer::plots;
+use rcwm_trainer::replay::Folder;
+use serde::Serialize;
+
+/// Judge models: robot dynamics on recorded episodes, or success in the simulator
+#[derive(Debug, clap::Args)]
+#[command(after_help = "Examples:
+  rcwm-trainer evaluate --checkpoint runs/small/checkpoints/best --checkpoint runs/vanilla/checkpoints/best --data data/unseen \\
+      --out runs/dynamics --json runs/dynamics/report.json
+  rcwm-trainer evaluate --checkpoint runs/hammer/checkpoints/best --task hammer --episodes 20
+  rcwm-trainer evaluate --bundle bundles/hammer --task hammer --episodes 20 --disturb textures --simulators 2
+
+With --data (paper, Fig. 4 and 7): every model sees some steps of the same trajectories and imagines the rest with the recorded
+actions. The robot dynamics error is the squared error between imagined and true picture, both multiplied by the true robot mask, mean
+over the whole picture; the episodes need masks. With --task: the policy is exported and deployed by rcwm-runtime in
+rcwm-simulator, in lock-step.")]
+#[command(group = clap::ArgGroup::new("on").required(true).args(["data", "tasks"]))]
+pub struct Evaluate {
+    /// Folder of a checkpoint (repeatable with --data: the later ones are compared with the first)
+    #[arg(long = "checkpoint", value_name = "DIR", required_unless_present = "bundle")]
+    checkpoints: Vec<PathBuf>,
+    /// Folder of recorded episodes with masks, one sub-folder a task
+    #[arg(long, value_name = "DIR")]
+    data: Option<PathBuf>,
+    /// Folder of masks as pictures, task/episode/*.png, in place of the episodes' own
+    #[arg(long, value_name = "DIR", requires = "data")]
+    masks: Option<PathBuf>,
+    /// Trajectories a task
+    #[arg(long, default_value_t = 100, value_name = "N")]
+    trajectories: usize,
+    /// Steps that are seen
+    #[arg(long, default_value_t = 10, value_name = "N")]
+    context: usize,
+    /// Steps that are imagined after them
+    #[arg(long, default_value_t = 54, value_name = "N")]
+    imagined: usize,
+    /// Take the most probable latents and actions, or draw them [default: sample with --data, mode with --task]
+    #[arg(long, value_enum)]
+    latents: Option<LatentsName>,
+    /// Films a task and model, written to --out
+    #[arg(long, default_value_t = 2, value_name = "N")]
+    films: usize,
+    /// Folder for plots and films
+    #[arg(long, value_name = "DIR", requires = "data")]
+    out: Option<PathBuf>,
+    /// Task to solve in the simulator (repeatable)
+    #[arg(long = "task", value_name = "TASK")]
+    tasks: Vec<String>,
+    /// An exported policy in place of a checkpoint
+    #[arg(long, value_name = "DIR", conflicts_with_all = ["checkpoints", "data"])]
+    bundle: Option<PathBuf>,
+    /// Episodes of each task
+    #[arg(long, default_value_t = 20, value_name = "N", value_parser = clap::value_parser!(u64).range(1..))]
+    episodes: u64,
+    /// Decisions in an episode
+    #[arg(long, default_value_t = 250, value_name = "N", value_parser = clap::value_parser!(u32).range(1..=250))]
+    steps_max: u32,
+    /// Visual disturbance
+    #[arg(long, default_value = "none", value_parser = ["none", "textures", "noise"])]
+    disturb: String,
+    /// The runtime's engine
+    #[arg(long, default_value = "tract", value_parser = ["tract", "ort"])]
+    engine: String,
+    /// Simulators at a time, each with a runtime
+    #[arg(long, default_value_t = 1, value_name = "N", value_parser = clap::value_parser!(u64).range(1..=256))]
+    simulators: u64,
+    /// Path of rcwm-simulator, where it is not beside this program
+    #[arg(long, value_name = "FILE")]
+    simulator: Option<PathBuf>,
+    /// Path of rcwm-runtime, where it is not beside this program
+    #[arg(long, value_name = "FILE")]
+    runtime: Option<PathBuf>,
+    /// Trajectories, draws and layouts depend on this
+    #[arg(long, default_value_t = 0)]
+    seed: u64,
+    /// Where to compute with --data: cpu, cuda or cuda:N
+    #[arg(long, default_value = "cpu")]
+    device: String,
+    /// Write what was measured as JSON
+    #[arg(long, value_name = "FILE")]
+    json: Option<PathBuf>,
+}
+
+#[derive(Debug, Clone, Copy, PartialEq, Eq, clap::ValueEnum)]
+enum LatentsName {
+    /// Drawn, by --seed.
+    Sample,
+    /// The most probable ones.
+    Mode,
+}
+
+impl Evaluate {
+    pub fn run(self) -> Result<ExitCode> {
+        let stop = super::stop_on_ctrl_c()?;
+        match &self.data {
+            Some(data) => self.open_loop(data, &stop)?,
+            None => self.closed_loop(&stop)?,
+        }
+        Ok(ExitCode::SUCCESS)
+    }
+
+    fn open_loop(&self, data: &Path, stop: &AtomicBool) -> Result<()> {
+        let latents = match self.latents {
+            Some(LatentsName::Mode) => Latents::Mode,
+            _ => Latents::Sample,
+        };
+        let films = if self.out.is_some() { self.films } else { 0 };
+        let (context, imagined) = (self.context, self.imagined);
+        ensure!(context > 0 && imagined > 0, "--context and --imagined: expected at least 1");
+        ensure!(self.trajectories > 0, "--trajectories: expected at least 1");
+        let settings = OpenLoopSettings {
+            trajectories: self.trajectories,
+            context,
+            imagined,
+            latents,
+            seed: self.seed,
+            films,
+        };
+        let device = super::parse_device(&self.device)?;
+        let models = self.models(&device)?;
+        let tasks = self.trajectories(data, &settings)?;
+        let report = self.measure(&models, &tasks, &settings, &device, stop)?;
+        print!("{}", report.table());
+        if let Some(out) = &self.out {
+            for measure in Measure::ALL {
+                plots::write_png(&report.plot(measure)?, &out.join(format!("{}.png", measure.name())))?;
+            }
+            println!("plots and films in {}", out.display());
+        }
+        self.json.as_deref().map_or(Ok(()), |file| super::write_json(file, &report))
+    }
+
+    /// The checkpoints by name: what kind of model they are, or where they lie if there are several of a kind.
+    fn models(&self, device: &Device) -> Result<Vec<(String, PathBuf, Checkpoint)>> {
+        let mut models = Vec::new();
+        for path in &self.checkpoints {
+            let checkpoint = Checkpoint::read(path, device)?;
+            let kind = format!("{:?}", checkpoint.settings.model.kind).to_lowercase();
+            models.push((kind, path.clone(), checkpoint));
+        }
+        let kinds: Vec<String> = models.iter().map(|(kind, ..)| kind.clone()).collect();
+        for (name, path, _) in &mut models {
+            if kinds.iter().filter(|kind| *kind == name).count() > 1 {
+                *name = path.display().to_string().trim_end_matches("/").replace("/checkpoints/", "/");
+            }
+        }
+        Ok(models)
+    }
+
+    fn trajectories(&self, data: &Path, settings: &OpenLoopSettings) -> Result<Vec<TaskTrajectories>> {
+        let folder = Folder::list(data, self.masks.as_deref())?;
+        let bar = ProgressBar::new(folder.len() as u64)
+            .with_style(ProgressStyle::with_template("loading {wide_bar} {pos}/{len} episodes")?);
+        let replay = folder.load_where(|episode| episode.robot_mask.is_some(), usize::MAX, || bar.inc(1))?;
+        bar.finish_and_clear();
+        let length = settings.context + settings.imagined;
+        let tasks = TaskTrajectories::choose(&replay, settings.trajectories, length, settings.seed)?;
+        for task in &tasks {
+            println!("{}: {} trajectories of {} episodes", task.task, task.chosen.len(), task.episodes());
+        }
+        Ok(tasks)
+    }
+
+    fn measure(
+        &self,
+        models: &[(String, PathBuf, Checkpoint)],
+        tasks: &[TaskTrajectories],
+        settings: &OpenLoopSettings,
+        device: &Device,
+        stop: &AtomicBool,
+    ) -> Result<OpenLoopReport> {
+        let total: usize = tasks.iter().map(|task| task.chosen.len() * models.len()).sum();
+        let template = "{wide_bar} {pos}/{len} trajectories, ETA {eta}, {msg}";
+        let bar = ProgressBar::new(total as u64).with_style(ProgressStyle::with_template(template)?);
+        let mut report = OpenLoopReport::new(*settings);
+        let mut first: Vec<Measured> = Vec::new();
+        for (name, path, checkpoint) in models {
+            let agent = Agent::new(&checkpoint.parameters.frozen(), &checkpoint.settings.model)?;
+            let mut reports = Vec::new();
+            for (index, task) in tasks.iter().enumerate() {
+                bar.set_message(format!("{name} on {}", task.task));
+                let measured = measure(&agent, task, settings, device, stop, |rows| bar.inc(rows as u64))?;
+                self.write_films(name, &task.task, &measured)?;
+                reports.push(TaskReport::of(task, &measured, settings.seed));
+                match (first.get(index), &report.models.first()) {
+                    (Some(other), Some(against)) => report.comparisons.extend(Comparison::of(
+                        task,
+                        (name, &measured),
+                        (&against.name, other),
+                        settings.seed,
+                    )),
+                    _ => first.push(Measured { films: Vec::new(), ..measured }),
+                }
+            }
+            let settings = &checkpoint.settings;
+            report.models.push(ModelReport {
+                name: name.clone(),
+                checkpoint: path.display().to_string(),
+                kind: settings.model.kind,
+                preset: settings.preset.clone(),
+                updates: settings.updates,
+                tasks: reports,
+            });
+        }
+        bar.finish_and_clear();
+        Ok(report)
+    }
+
+    fn write_films(&self, model: &str, task: &str, measured: &Measured) -> Result<()> {
+        let Some(out) = &self.out else { return Ok(()) };
+        let films = out.join("films");
+        std::fs::create_dir_all(&films).with_context(|| format!("--out {}", films.display()))?;
+        for (number, film) in measured.films.iter().enumerate() {
+            let stem = format!("{}-{task}-{number}", model.replace('/', "-"));
+            film.write_strip(STRIP_EVERY, &films.join(format!("{stem}.png")))?;
+            film.write_gif(&films.join(format!("{stem}.gif")))?;
+        }
+        Ok(())
+    }
+
+    fn closed_loop(&self, stop: &AtomicBool) -> Result<()> {
+        for task in &self.tasks {
+            task_id(task)?;
+        }
+        ensure!(self.checkpoints.len() < 2, "--task takes one --checkpoint; run one after the other");
+        let folder = tempfile::tempdir().context("temporary folder for the bundle")?;
+        let bundle = match (&self.bundle, self.checkpoints.first()) {
+            (Some(bundle), _) => std::path::absolute(bundle)?,
+            (None, Some(checkpoint)) => self.exported(checkpoint, folder.path(), stop)?,
+            (None, None) => anyhow::bail!("give --checkpoint or --bundle"),
+        };
+        let mut reports = Vec::new();
+        for task in &self.tasks {
+            let bar = episodes_bar(self.episodes, self.steps_max, task)?;
+            let show = |positions: &[Position]| {
+                let steps = |at: &Position| at.episodes * u64::from(self.steps_max) + u64::from(at.steps);
+                bar.set_position(positions.iter().map(steps).sum());
+            };
+            let report = closed_loop(&bundle, &self.loop_settings(task), stop, show);
+            bar.finish_and_clear();
+            let report = report?;
+            println!("{}", describe(&report));
+            reports.push(report);
+        }
+        let of = self.bundle.as_ref().or(self.checkpoints.first());
+        let outcome = ClosedLoop { of, tasks: reports };
+        self.json.as_deref().map_or(Ok(()), |file| super::write_json(file, &outcome))
+    }
+
+    fn loop_settings(&self, task: &str) -> ClosedLoopSettings {
+        ClosedLoopSettings {
+            task: task.to_owned(),
+            episodes: self.episodes,
+            seed: self.seed,
+            steps_max: self.steps_max,
+            disturb: self.disturb.clone(),
+            engine: self.engine.clone(),
+            sample: self.latents == Some(LatentsName::Sample),
+            simulators: self.simulators,
+            simulator: self.simulator.clone(),
+            runtime: self.runtime.clone(),
+        }
+    }
+
+    /// Exports a checkpoint's policy into `folder`.
+    fn exported(&self, checkpoint: &Path, folder: &Path, stop: &AtomicBool) -> Result<PathBuf> {
+        let checkpoint = Checkpoint::read(checkpoint, &Device::Cpu)?;
+        let place = folder.join("bundle");
+        let options = Options {
+            task: self.tasks.first().cloned().unwrap_or_default(),
+            rate_hz: 40.0,
+            parts: PartName::REQUIRED.to_vec(),
+            golden_episode: None,
+            golden_ticks: 1,
+            golden_seed: 0,
+            source_revision: env!("RCWM_SOURCE_REVISION").to_owned(),
+            replace: false,
+        };
+        export::write(&checkpoint, &place, &options, &Stop(stop))?;
+        Ok(place)
+    }
+}
+
+/// Steps from one picture of a strip to the next.
+const STRIP_EVERY: usize = 4;
+
+/// Ends an export on Ctrl-C.
+struct Stop<'a>(&'a AtomicBool);
+
+impl export::Progress for Stop<'_> {
+    fn step(&self, _what: &str, _done: usize, _total: usize) -> Result<(), ExportError> {
+        if self.0.load(Ordering::Relaxed) { Err(ExportError::Interrupted) } else { Ok(()) }
+    }
+}
+
+/// What is written with `--json`.
+#[derive(Serialize)]
+struct ClosedLoop<'a> {
+    of: Option<&'a PathBuf>,
+    tasks: Vec<ClosedLoopReport>,
+}
+
+fn episodes_bar(episodes: u64, steps_max: u32, task: &str) -> Result<ProgressBar> {
+    let template = "{msg} {wide_bar} {pos}/{len} steps, {per_sec}, ETA {eta}";
+    let bar = ProgressBar::new(episodes * u64::from(steps_max))
+        .with_style(ProgressStyle::with_template(template)?)
+        .with_message(task.to_owned());
+    bar.enable_steady_tick(Duration::from_millis(200));
+    Ok(bar)
+}
+
+fn describe(report: &ClosedLoopReport) -> String {
+    let ClosedLoopReport { settings, episodes, successes, interval, return_mean, return_std, .. } = report;
+    let percent = |x: f64| format!("{:.0}%", 100.0 * x);
+    let disturbed =
+        if settings.disturb == "none" { String::new() } else { format!(", {} disturbed", settings.disturb) };
+    format!(
+        "{}{disturbed}: success {} ({successes} of {episodes}; 95% {} to {}), return {return_mean:.1} +- {return_std:.1}; {} steps \
+         in {:.0} s",
+        settings.task,
+        percent(report.success_rate),
+        percent(interval.low),
+        percent(interval.high),
+        report.steps,
+        report.seconds
+    )
+}

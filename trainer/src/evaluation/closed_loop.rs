@@ -1,0 +1,369 @@
+use std::path::{Path, PathBuf};
+use std::process::Command;
+use std::sync::atomic::{AtomicBool, AtomicU32, Ordering};
+use std::time::{Duration, Instant};
+
+use rcwm_models::files::{FileError, read_capped};
+use rcwm_models::wire::{LinkError, LinkSettings, ObserverLink, Wait, forget_prefix};
+use serde::{Deserialize, Serialize};
+
+use super::statistics::{Interval, mean_and_std, wilson};
+use crate::simulators::{ProcessError, Program, RunningProgram};
+
+/// A simulator or runtime whose other side is gone ends by itself after so many seconds.
+const SILENCE_S: &str = "120";
+/// How long one side may run without the other.
+const GRACE: Duration = Duration::from_secs(30);
+/// Between two looks at the processes.
+const LOOK: Duration = Duration::from_millis(50);
+/// Largest summary of a process that is read, in bytes.
+const SUMMARY_BYTES_MAX: u64 = 64 << 20;
+
+/// Why the closed loop could not be run.
+#[derive(Debug, thiserror::Error)]
+pub enum ClosedLoopError {
+    /// A program is missing, did not start, or failed.
+    #[error(transparent)]
+    Process(#[from] ProcessError),
+    /// A runtime left its simulator alone.
+    #[error("rcwm-runtime of {instance:?} ended long before its simulator did; run both by hand to see why")]
+    Left {
+        /// Their link.
+        instance: String,
+    },
+    /// A runtime did not end.
+    #[error("rcwm-runtime of {instance:?} still runs {} s after its simulator ended", GRACE.as_secs())]
+    Hangs {
+        /// Their link.
+        instance: String,
+    },
+    /// The loop could not be watched.
+    #[error(transparent)]
+    Link(#[from] LinkError),
+    /// There is no folder for summaries.
+    #[error("temporary folder: {0}")]
+    Folder(#[source] std::io::Error),
+    /// A summary is missing.
+    #[error("summary: {0}")]
+    File(#[from] FileError),
+    /// A summary is unreadable.
+    #[error("summary {path}: {source}; use programs of one version")]
+    Summary {
+        /// The file.
+        path: PathBuf,
+        /// What is wrong.
+        source: serde_json::Error,
+    },
+    /// It was stopped.
+    #[error("interrupted; the simulators and runtimes were ended")]
+    Interrupted,
+}
+
+/// What to run.
+#[derive(Debug, Clone, PartialEq, Serialize)]
+pub struct ClosedLoopSettings {
+    /// Name of the task.
+    pub task: String,
+    /// Episodes in all.
+    pub episodes: u64,
+    /// Layouts depend on this and on an episode's number only, so that every policy meets the same ones.
+    pub seed: u64,
+    /// Decisions in an episode.
+    pub steps_max: u32,
+    /// Visual disturbance: `none`, `textures` or `noise`.
+    pub disturb: String,
+    /// The runtime's engine: `tract` or `ort`.
+    pub engine: String,
+    /// Whether latents and actions are drawn instead of the most probable ones.
+    pub sample: bool,
+    /// Simulators at a time, each with a runtime.
+    pub simulators: u64,
+    /// The simulator's path, where it is not beside this program.
+    pub simulator: Option<PathBuf>,
+    /// The runtime's path, where it is not beside this program.
+    pub runtime: Option<PathBuf>,
+}
+
+/// How well a policy solves a task.
+#[derive(Debug, Clone, PartialEq, Serialize)]
+pub struct ClosedLoopReport {
+    /// What was run.
+    pub settings: ClosedLoopSettings,
+    /// Whole episodes.
+    pub episodes: usize,
+    /// Those in which the task was solved at some step.
+    pub successes: usize,
+    /// Their share.
+    pub success_rate: f64,
+    /// Wilson's 95% interval of it.
+    pub interval: Interval,
+    /// Mean return of an episode.
+    pub return_mean: f64,
+    /// Standard deviation over episodes.
+    pub return_std: f64,
+    /// By episode.
+    pub returns: Vec<f64>,
+    /// By episode.
+    pub successful: Vec<bool>,
+    /// Decisions.
+    pub steps: u64,
+    /// Of the clock, loading included.
+    pub seconds: f64,
+    /// What every runtime says of itself: latencies, fallbacks, imagined steps.
+    pub runtimes: Vec<serde_json::Value>,
+}
+
+/// How far a simulator is.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
+pub struct Position {
+    /// Whole episodes behind it.
+    pub episodes: u64,
+    /// Steps of the present one.
+    pub steps: u32,
+}
+
+/// The part of a simulator's summary that is read.
+#[derive(Debug, Deserialize)]
+struct Served {
+    returns: Vec<f64>,
+    successful: Vec<bool>,
+    steps: u64,
+}
+
+/// Runs a bundle's policy in simulators, in lock-step, and counts its successes. `seen` hears how far each simulator is.
+///
+/// # Errors
+/// See [`ClosedLoopError`]; every process has ended then.
+pub fn closed_loop(
+    bundle: &Path,
+    settings: &ClosedLoopSettings,
+    stop: &AtomicBool,
+    mut seen: impl FnMut(&[Position]),
+) -> Result<ClosedLoopReport, ClosedLoopError> {
+    let begin = Instant::now();
+    let programs = Programs::find(settings)?;
+    let folder = tempfile::tempdir().map_err(ClosedLoopError::Folder)?;
+    let domain = Domain::new();
+    let loops = settings.simulators.clamp(1, settings.episodes.max(1));
+    let share = |number: u64| settings.episodes * number / loops;
+    let start = |number: u64| {
+        let (first, last) = (share(number), share(number + 1));
+        Pair::start(&programs, bundle, settings, &domain, folder.path(), number, (first, last - first))
+    };
+    let mut pairs = (0..loops).map(start).collect::<Result<Vec<_>, _>>()?;
+    loop {
+        if stop.load(Ordering::Relaxed) {
+            return Err(ClosedLoopError::Interrupted);
+        }
+        let mut runs = false;
+        for pair in &mut pairs {
+            runs |= pair.is_running()?;
+        }
+        seen(&pairs.iter().map(|pair| pair.position).collect::<Vec<_>>());
+        if !runs {
+            break;
+        }
+        std::thread::sleep(LOOK);
+    }
+    let served = pairs.iter().map(|pair| read_json(&pair.served)).collect::<Result<Vec<Served>, _>>()?;
+    let runtimes = pairs.iter().map(|pair| read_json(&pair.ran)).collect::<Result<_, _>>()?;
+    Ok(ClosedLoopReport::new(settings.clone(), &served, runtimes, begin.elapsed()))
+}
+
+impl ClosedLoopReport {
+    fn new(
+        settings: ClosedLoopSettings,
+        served: &[Served],
+        runtimes: Vec<serde_json::Value>,
+        time: Duration,
+    ) -> Self {
+        let returns: Vec<f64> = served.iter().flat_map(|served| served.returns.iter().copied()).collect();
+        let successful: Vec<bool> =
+            served.iter().flat_map(|served| served.successful.iter().copied()).collect();
+        let (episodes, successes) = (successful.len(), successful.iter().filter(|success| **success).count());
+        let (return_mean, return_std) = mean_and_std(returns.iter().copied()).unwrap_or_default();
+        Self {
+            settings,
+            episodes,
+            successes,
+            success_rate: successes as f64 / episodes.max(1) as f64,
+            interval: wilson(successes, episodes),
+            return_mean,
+            return_std,
+            returns,
+            successful,
+            steps: served.iter().map(|served| served.steps).sum(),
+            seconds: time.as_secs_f64(),
+            runtimes,
+        }
+    }
+}
+
+/// Where the programs are.
+struct Programs {
+    simulator: PathBuf,
+    runtime: PathBuf,
+}
+
+impl Programs {
+    /// Both, before either is started.
+    fn find(settings: &ClosedLoopSettings) -> Result<Self, ProcessError> {
+        let named =
+            |path: &Option<PathBuf>, program: Program| path.clone().map_or_else(|| program.find(), Ok);
+        Ok(Self {
+            simulator: named(&settings.simulator, Program::SIMULATOR)?,
+            runtime: named(&settings.runtime, Program::RUNTIME)?,
+        })
+    }
+}
+
+/// A shared-memory domain of this evaluation's own: nothing else that runs on the machine can meet it.
+struct Domain {
+    prefix: String,
+}
+
+impl Domain {
+    fn new() -> Self {
+        static COUNT: AtomicU32 = AtomicU32::new(0);
+        let count = COUNT.fetch_add(1, Ordering::Relaxed);
+        Self { prefix: format!("rcwm_e{}_{count}_", std::process::id()) }
+    }
+
+    fn link(&self, instance: &str) -> LinkSettings {
+        LinkSettings { prefix: Some(self.prefix.clone()), ..LinkSettings::new(instance) }
+    }
+}
+
+impl Drop for Domain {
+    fn drop(&mut self) {
+        forget_prefix(&self.prefix);
+    }
+}
+
+/// A simulator and its runtime. The order of the fields is that in which they end: first who watches, then the simulator, which
+/// tells the runtime.
+struct Pair {
+    observer: ObserverLink,
+    simulator: RunningProgram,
+    runtime: RunningProgram,
+    instance: String,
+    first_episode: u64,
+    position: Position,
+    /// Since when one side runs without the other.
+    alone: Option<Instant>,
+    served: PathBuf,
+    ran: PathBuf,
+}
+
+impl Pair {
+    fn start(
+        programs: &Programs,
+        bundle: &Path,
+        settings: &ClosedLoopSettings,
+        domain: &Domain,
+        folder: &Path,
+        number: u64,
+        (first_episode, episodes): (u64, u64),
+    ) -> Result<Self, ClosedLoopError> {
+        let instance = format!("evaluate-{number}");
+        let file = |side: &str| folder.join(format!("{side}-{number}.json"));
+        let (served, ran) = (file("simulator"), file("runtime"));
+        let observer = ObserverLink::open(domain.link(&instance))?;
+        let mut command = Command::new(&programs.simulator);
+        command
+            .env("RCWM_PREFIX", &domain.prefix)
+            .args(["serve", "--pace", "lockstep", "--policy", "remote", "--wait-controller", SILENCE_S])
+            .args(["--task", &settings.task, "--instance", &instance, "--disturb", &settings.disturb])
+            .args(["--seed", &settings.seed.to_string()])
+            .args(["--first-episode", &first_episode.to_string()])
+            .args(["--episodes", &episodes.to_string()])
+            .args(["--steps-max", &settings.steps_max.to_string(), "--json"])
+            .arg(&served);
+        let simulator = RunningProgram::start(Program::SIMULATOR, &instance, command)?;
+        let mut command = Command::new(&programs.runtime);
+        command
+            .env("RCWM_PREFIX", &domain.prefix)
+            .args(["run", "--instance", &instance, "--engine", &settings.engine, "--timeout", SILENCE_S])
+            .args(["--seed", &settings.seed.to_string()])
+            .args(settings.sample.then_some("--sample"))
+            .arg("--bundle")
+            .arg(bundle)
+            .arg("--json")
+            .arg(&ran);
+        let runtime = RunningProgram::start(Program::RUNTIME, &instance, command)?;
+        let position = Position::default();
+        Ok(Self { observer, simulator, runtime, instance, first_episode, position, alone: None, served, ran })
+    }
+
+    /// Whether either side still runs.
+    fn is_running(&mut self) -> Result<bool, ClosedLoopError> {
+        if let Wait::Message(observation) = self.observer.wait_observation(Duration::ZERO)? {
+            let episodes = observation.episode.saturating_sub(self.first_episode);
+            self.position = Position { episodes, steps: observation.step };
+        }
+        let (serves, controls) = (self.simulator.is_running()?, self.runtime.is_running()?);
+        // Who has said goodbye may need a while to end.
+        if serves == controls {
+            self.alone = None;
+        } else if self.alone.get_or_insert_with(Instant::now).elapsed() > GRACE {
+            let instance = self.instance.clone();
+            return Err(if serves {
+                ClosedLoopError::Left { instance }
+            } else {
+                ClosedLoopError::Hangs { instance }
+            });
+        }
+        Ok(serves || controls)
+    }
+}
+
+fn read_json<T: serde::de::DeserializeOwned>(path: &Path) -> Result<T, ClosedLoopError> {
+    let bytes = read_capped(path, SUMMARY_BYTES_MAX)?;
+    serde_json::from_slice(&bytes)
+        .map_err(|source| ClosedLoopError::Summary { path: path.to_path_buf(), source })
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn settings() -> ClosedLoopSettings {
+        ClosedLoopSettings {
+            task: "reach".into(),
+            episodes: 4,
+            seed: 0,
+            steps_max: 5,
+            disturb: "none".into(),
+            engine: "tract".into(),
+            sample: false,
+            simulators: 1,
+            simulator: Some("/bin/false".into()),
+            runtime: Some("/bin/true".into()),
+        }
+    }
+
+    #[test]
+    fn a_program_that_fails_is_one_clear_error() {
+        let run = |settings: &ClosedLoopSettings| {
+            closed_loop(Path::new("nowhere"), settings, &AtomicBool::new(false), |_| ()).unwrap_err()
+        };
+        let text = run(&settings()).to_string();
+        assert!(text.contains("rcwm-simulator") && text.contains("evaluate-0"), "{text}");
+        let missing = ClosedLoopSettings { simulator: Some("/no/such/program".into()), ..settings() };
+        assert!(run(&missing).to_string().contains("/no/such/program"));
+    }
+
+    #[test]
+    fn successes_of_several_simulators_are_counted_together() {
+        let served = |returns: &[f64], successful: &[bool]| Served {
+            returns: returns.to_vec(),
+            successful: successful.to_vec(),
+            steps: 10,
+        };
+        let served = [served(&[1.0, 3.0], &[true, false]), served(&[5.0, 7.0], &[true, true])];
+        let report = ClosedLoopReport::new(settings(), &served, Vec::new(), Duration::from_secs(1));
+        assert_eq!((report.episodes, report.successes, report.success_rate), (4, 3, 0.75));
+        assert_eq!((report.return_mean, report.steps), (4.0, 20));
+        assert!(report.interval.low < 0.75 && report.interval.high > 0.75);
+    }
+}
