@@ -6,6 +6,7 @@
 //! | [`model`] | RCWM and the vanilla baseline |
 //! | [`learning`] | losses, gradients and updates of the world model |
 //! | [`behaviour`] | imagination with the actor, returns, actor and critic updates |
+//! | [`cloning`] | the actor from demonstrations |
 //! | [`replay`] | experience in memory, batches drawn from it |
 //! | [`simulators`] | Meta-World processes: started, joined, recorded |
 //! | [`training`] | runs: phases, metrics, checkpoints, resuming |
@@ -17,6 +18,7 @@
 
 pub mod behaviour;
 pub mod checkpoint;
+pub mod cloning;
 pub mod export;
 pub mod learning;
 pub mod model;

@@ -1,7 +1,9 @@
 //! The command line, one file per verb.
 
+mod bars;
 mod collect;
 mod export;
+mod fewshot;
 mod init;
 mod parameters;
 mod parity;
@@ -33,6 +35,7 @@ enum Verb {
     Init(init::Init),
     Export(export::Export),
     Pretrain(pretrain::Pretrain),
+    Fewshot(fewshot::Fewshot),
 }
 
 impl Arguments {
@@ -45,6 +48,7 @@ impl Arguments {
             Verb::Init(verb) => verb.run(),
             Verb::Export(verb) => verb.run(),
             Verb::Pretrain(verb) => verb.run(),
+            Verb::Fewshot(verb) => verb.run(),
         }
     }
 }

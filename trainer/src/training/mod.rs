@@ -19,16 +19,30 @@
 //! | `state` | what a checkpoint holds beside the weights |
 //! | `run` | the folder: settings, metrics, checkpoints |
 //! | `film` | film strips of the open loop |
-//! | `pretrain` | the phase: mask warm-up, then mask-free updates |
+//! | `pretrain` | the first phase: mask warm-up, then mask-free updates |
+//! | `phases` | what can be chosen for the phases that learn a task |
+//! | `reset` | what such a phase starts from |
+//! | `demonstrations`, `fewshot` | a task from recorded successes alone |
+//! | `averages` | their lines of metrics |
 
+mod averages;
+mod demonstrations;
+mod fewshot;
 mod film;
+mod phases;
 mod pretrain;
+mod reset;
 mod run;
 mod settings;
 mod state;
 
+pub use averages::{Averages, Interval, Line, Spent};
+pub use demonstrations::demonstrations;
+pub use fewshot::{Fewshot, Stage};
 pub use film::{FilmSettings, film_strip, write_png};
+pub use phases::{FewshotSettings, FinetuneSettings, Phase};
 pub use pretrain::{Outcome, Pretraining, Progress};
+pub use reset::{Reset, ResetSettings, start_from};
 pub use run::{Metrics, Run};
 pub use settings::{PretrainSettings, ReplaySettings, TrainingSettings};
 pub use state::{StateError, TrainingState};
@@ -57,6 +71,26 @@ pub enum TrainingError {
         path: PathBuf,
         /// What is missing.
         file: &'static str,
+    },
+    /// The folder holds a run of another kind.
+    #[error("{path} holds a run of {found}; resume it with `rcwm-trainer {found} --resume`")]
+    OtherPhase {
+        /// The folder.
+        path: PathBuf,
+        /// What made it.
+        found: &'static str,
+    },
+    /// No demonstration is among the data.
+    #[error(
+        "none of the {episodes} episodes of {task} in {path} was successful; record some: rcwm-trainer collect --task {task} --expert 50"
+    )]
+    NoDemonstrations {
+        /// Where was looked.
+        path: PathBuf,
+        /// The task.
+        task: String,
+        /// Episodes that were looked at.
+        episodes: usize,
     },
     /// A resumed run would have another model.
     #[error("the model's sizes differ from those of the run's checkpoint; a resumed run keeps its model")]

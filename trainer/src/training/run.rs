@@ -121,6 +121,16 @@ impl Run {
         self.metrics.write_all(&line).map_err(failed(&self.folder.join(METRICS_FILE)))
     }
 
+    /// Appends a line of another kind of metrics; it tells the `update` that it was written after.
+    ///
+    /// # Errors
+    /// Those of writing.
+    pub fn log_line(&mut self, line: &impl Serialize) -> Result<(), TrainingError> {
+        let mut line = serde_json::to_vec(line)?;
+        line.push(b'\n');
+        self.metrics.write_all(&line).map_err(failed(&self.folder.join(METRICS_FILE)))
+    }
+
     /// Where the film strip of a task at this update goes; the folder is made.
     ///
     /// # Errors

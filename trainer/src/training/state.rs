@@ -63,10 +63,20 @@ pub struct TrainingState {
     pub updates: u64,
     /// Lowest mask-free loss over an interval between checkpoints; none before the first.
     pub best_loss: Option<f64>,
+    /// Highest success rate at a checkpoint of a run that acts; none before the first.
+    #[serde(default)]
+    pub best_success: Option<f64>,
+    /// Steps that the policy has made.
+    #[serde(default)]
+    pub policy_steps: u64,
+    /// Episodes that the policy has finished.
+    #[serde(default)]
+    pub episodes: u64,
     /// The returns' average range.
     pub return_range: ReturnRange,
     /// Steps of every parameter's optimiser, by optimiser and name.
-    pub steps: BTreeMap<String, u64>,
+    #[serde(rename = "steps")]
+    pub optimiser_steps: BTreeMap<String, u64>,
 }
 
 /// The file that goes with these weights. Its name ties it to them: a checkpoint's settings name the weights, and whoever dies
@@ -93,7 +103,7 @@ impl TrainingState {
                 let key = format!("{optimiser}/{name}");
                 arrays.insert(format!("{key}/first"), bytes(&moments.first)?);
                 arrays.insert(format!("{key}/second"), bytes(&moments.second)?);
-                state.steps.insert(key, moments.steps);
+                state.optimiser_steps.insert(key, moments.steps);
             }
         }
         let views = arrays
@@ -149,7 +159,7 @@ impl TrainingState {
         parameters: &Parameters,
     ) -> Result<Adam, StateError> {
         let mut moments = BTreeMap::new();
-        for (key, steps) in &self.steps {
+        for (key, steps) in &self.optimiser_steps {
             let Some(name) = key.strip_prefix(optimiser).and_then(|rest| rest.strip_prefix('/')) else {
                 continue;
             };
