@@ -4,10 +4,13 @@ mod bars;
 mod collect;
 mod export;
 mod fewshot;
+mod finetune;
 mod init;
+mod online;
 mod parameters;
 mod parity;
 mod pretrain;
+mod train;
 
 use std::path::Path;
 use std::process::ExitCode;
@@ -36,6 +39,8 @@ enum Verb {
     Export(export::Export),
     Pretrain(pretrain::Pretrain),
     Fewshot(fewshot::Fewshot),
+    Finetune(finetune::Finetune),
+    Train(train::Train),
 }
 
 impl Arguments {
@@ -49,6 +54,8 @@ impl Arguments {
             Verb::Export(verb) => verb.run(),
             Verb::Pretrain(verb) => verb.run(),
             Verb::Fewshot(verb) => verb.run(),
+            Verb::Finetune(verb) => verb.run(),
+            Verb::Train(verb) => verb.run(),
         }
     }
 }

@@ -13,8 +13,10 @@
 
 mod load;
 mod prefetch;
+mod shared;
 mod store;
 
 pub use load::{Folder, LoadError};
 pub use prefetch::{Prefetch, PrefetchError};
+pub use shared::SharedReplay;
 pub use store::{Replay, ReplayError};

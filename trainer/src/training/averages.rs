@@ -86,6 +86,11 @@ pub struct Line {
 }
 
 impl Line {
+    /// Tells another number.
+    pub fn set(&mut self, name: &str, number: f64) {
+        self.values.insert(name.to_owned(), number.into());
+    }
+
     /// The number under a dotted name.
     #[must_use]
     pub fn number(&self, name: &str) -> Option<f64> {
@@ -122,8 +127,13 @@ impl Interval {
     pub fn time<T>(&mut self, on: Spent, work: impl FnOnce() -> T) -> T {
         let begin = Instant::now();
         let result = work();
-        *self.spent.entry(on).or_default() += begin.elapsed();
+        self.add(on, begin.elapsed());
         result
+    }
+
+    /// Counts time that was spent.
+    pub fn add(&mut self, on: Spent, time: Duration) {
+        *self.spent.entry(on).or_default() += time;
     }
 
     /// The line that ends here; the next one begins.

@@ -23,13 +23,16 @@
 //! | `phases` | what can be chosen for the phases that learn a task |
 //! | `reset` | what such a phase starts from |
 //! | `demonstrations`, `fewshot` | a task from recorded successes alone |
+//! | `prefill`, `finetune` | acting and learning, after pre-training or from scratch |
 //! | `averages` | their lines of metrics |
 
 mod averages;
 mod demonstrations;
 mod fewshot;
 mod film;
+mod finetune;
 mod phases;
+mod prefill;
 mod pretrain;
 mod reset;
 mod run;
@@ -40,17 +43,22 @@ pub use averages::{Averages, Interval, Line, Spent};
 pub use demonstrations::demonstrations;
 pub use fewshot::{Fewshot, Stage};
 pub use film::{FilmSettings, film_strip, write_png};
+pub use finetune::{EpisodeFacts, EpisodeLine, Finetuning, OnlineOutcome, OnlineProgress};
 pub use phases::{FewshotSettings, FinetuneSettings, Phase};
+pub use prefill::{Prefilled, episodes_folder, prefill};
 pub use pretrain::{Outcome, Pretraining, Progress};
 pub use reset::{Reset, ResetSettings, start_from};
 pub use run::{Metrics, Run};
 pub use settings::{PretrainSettings, ReplaySettings, TrainingSettings};
 pub use state::{StateError, TrainingState};
 
+use crate::acting::FleetError;
 use crate::checkpoint::CheckpointError;
 use crate::learning::LearningError;
 use crate::model::parameters::ParameterError;
 use crate::replay::{LoadError, PrefetchError, ReplayError};
+use crate::simulators::CollectError;
+use rcwm_models::episode::EpisodeError;
 use rcwm_models::files::FileError;
 use rcwm_models::settings::SettingsError;
 use std::path::PathBuf;
@@ -127,6 +135,15 @@ pub enum TrainingError {
     /// An update failed.
     #[error(transparent)]
     Learning(#[from] LearningError),
+    /// Acting in simulators failed.
+    #[error(transparent)]
+    Acting(#[from] FleetError),
+    /// Episodes could not be collected.
+    #[error(transparent)]
+    Collect(#[from] CollectError),
+    /// An episode could not be written.
+    #[error(transparent)]
+    Episode(#[from] EpisodeError),
     /// Data could not be loaded.
     #[error(transparent)]
     Load(#[from] LoadError),
