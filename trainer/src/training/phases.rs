@@ -166,9 +166,9 @@ impl FinetuneSettings {
                 expert_episodes: 1,
                 random_steps: 30,
                 warm_up_updates: 4,
-                steps: 60,
+                steps: 200,
                 train_ratio: 4.0,
-                episode_steps: 30,
+                episode_steps: 100,
                 ..paper
             },
             // On two cores an update takes about a second: at 512 the simulators would stand still.
