@@ -204,6 +204,7 @@ fn peak(repetitions: usize) -> Result<f64> {
 
 fn main() -> Result<()> {
     ops::leave_threads_to_ops();
+    ops::keep_freed_memory();
     let mut arguments = std::env::args().skip(1);
     let repetitions: usize = arguments.next().map_or(Ok(9), |text| text.parse())?;
     let filter = arguments.next().unwrap_or_default();

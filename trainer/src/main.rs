@@ -9,6 +9,7 @@ use rcwm_models::errors::one_line;
 
 fn main() -> ExitCode {
     rcwm_trainer::ops::leave_threads_to_ops();
+    rcwm_trainer::ops::keep_freed_memory();
     match cli::Arguments::parse().run() {
         Ok(code) => code,
         Err(error) => {

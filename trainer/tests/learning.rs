@@ -10,10 +10,13 @@ use rand_chacha::ChaCha8Rng;
 use rcwm_models::settings::{ModelKind, ModelSettings, Preset};
 use rcwm_models::{ACTION_LEN, IMAGE_BYTES, MASK_BYTES};
 use rcwm_trainer::behaviour::{BehaviourLearner, BehaviourSettings, Horizon};
-use rcwm_trainer::learning::{Batch, HostBatch, Side, Trained, WorldLearner, WorldSettings, side_of};
+use rcwm_trainer::learning::{
+    Batch, Gradients, HostBatch, Side, Trained, WorldLearner, WorldSettings, side_of,
+};
 use rcwm_trainer::model::agent;
 use rcwm_trainer::model::latent::Sampler;
 use rcwm_trainer::model::parameters::Parameters;
+use rcwm_trainer::ops;
 use rcwm_trainer::parity::{self, Group};
 
 /// A softmax does not see what is added to all of its inputs: the true gradient of the keys' bias is 0.
@@ -159,6 +162,55 @@ fn an_update_moves_what_it_trains_and_nothing_else() {
         let moves = matches!(side_of(name), Side::Actor | Side::Critic | Side::SlowCritic);
         assert_eq!(old != new, moves, "{name}");
     }
+}
+
+/// Asserts that two sets of gradients are the same but for rounding: that of a tensor whose terms nearly cancel is as large as the
+/// others'.
+fn assert_agree(found: &Gradients, expected: &Gradients) {
+    let largest = |x: &Tensor| {
+        f64::from(x.abs().unwrap().flatten_all().unwrap().max(0).unwrap().to_scalar::<f32>().unwrap())
+    };
+    for ((name, x), (other, y)) in found.iter().zip(expected.iter()) {
+        let (error, scale) = (largest(&(x - y).unwrap()), largest(y));
+        let allowed = 1e-4 * scale + 1e-6 * expected.norm();
+        assert!(name == other && error <= allowed, "{name}: {error:e} of {scale:e}, allowed {allowed:e}");
+    }
+}
+
+#[test]
+fn gradients_do_not_depend_on_how_many_threads_share_the_batch() {
+    let model = ModelSettings::preset(Preset::Debug, ModelKind::Rcwm);
+    let parameters = lively_parameters(&model);
+    let settings = WorldSettings { free_nats: 0.0, ..WorldSettings::default() };
+    let world = WorldLearner::new(&parameters, &model, &settings, Trained::World).unwrap();
+    let behaviour = BehaviourLearner::new(&parameters, &model, &BehaviourSettings::default()).unwrap();
+    let batch = batch(3, 4, true);
+    let run = || {
+        let (losses, gradients) = world.gradients(&batch, &mut Sampler::seeded(7)).unwrap();
+        let start = losses.observed.posteriors.map(|x| x.flatten(0, 1)).unwrap();
+        let mut sampler = Sampler::seeded(8);
+        let imagined = behaviour.imagine_shares(&start, &mut sampler).unwrap();
+        let behaviour = behaviour.clone().gradients(imagined).unwrap();
+        let next = sampler.gumbel(&[3], &Device::Cpu).unwrap().unwrap().to_vec1::<f32>().unwrap();
+        (losses.values().unwrap(), gradients, behaviour, next)
+    };
+    let shared = run();
+    // As one of very many tasks, each has a single thread.
+    let alone = ops::in_parallel((0..1000).collect(), |index| if index == 0 { Some(run()) } else { None });
+    let alone = alone.into_iter().flatten().next().unwrap();
+    for (found, expected) in [
+        (shared.0.total, alone.0.total),
+        (shared.0.robot_kl, alone.0.robot_kl),
+        (shared.0.robot_mask.unwrap(), alone.0.robot_mask.unwrap()),
+        (shared.2.values.actor_loss, alone.2.values.actor_loss),
+        (shared.2.values.critic_loss, alone.2.values.critic_loss),
+    ] {
+        assert!((found - expected).abs() <= 1e-5 * expected.abs().max(0.1), "{found} {expected}");
+    }
+    assert_agree(&shared.1, &alone.1);
+    assert_agree(&shared.2.actor, &alone.2.actor);
+    assert_agree(&shared.2.critic, &alone.2.critic);
+    assert_eq!(shared.3, alone.3);
 }
 
 #[test]

@@ -1,6 +1,7 @@
 use candle_core::{Result, Tensor};
 
 use super::{Horizon, lambda_return, step_weights};
+use crate::learning::parts::part;
 use crate::model::agent::Agent;
 use crate::model::latent::{Sampler, State};
 
@@ -36,6 +37,18 @@ pub fn imagine(
     horizon: &Horizon,
     sampler: &mut Sampler,
 ) -> Result<Imagination> {
+    let rollout = part("imagine", || rollout(agent, start, horizon, sampler))?;
+    part("judge", || judge(agent, horizon, rollout))
+}
+
+/// States, actions and entropies of an imagination: see [`Imagination`].
+struct Rollout {
+    features: Tensor,
+    actions: Tensor,
+    entropy: Tensor,
+}
+
+fn rollout(agent: &Agent, start: &State, horizon: &Horizon, sampler: &mut Sampler) -> Result<Rollout> {
     let mut state = start.clone();
     let mut features = vec![state.features()?];
     let mut actions = Vec::with_capacity(horizon.length);
@@ -48,20 +61,20 @@ pub fn imagine(
         actions.push(action);
         entropy.push(policy.entropy()?.unsqueeze(1)?);
     }
-    let features = Tensor::stack(&features, 0)?; // [L, N, state width]
+    Ok(Rollout {
+        features: Tensor::stack(&features, 0)?,
+        actions: Tensor::stack(&actions, 0)?,
+        entropy: Tensor::stack(&entropy, 0)?,
+    })
+}
+
+/// Rewards, values and returns of the states.
+fn judge(agent: &Agent, horizon: &Horizon, rollout: Rollout) -> Result<Imagination> {
+    let Rollout { features, actions, entropy } = rollout;
     let reward = agent.heads.reward.mean(&agent.heads.reward.logits(&features)?)?;
     let value = agent.critic.mean(&agent.critic.logits(&features)?)?;
     let discount = (agent.heads.continue_probability(&features)? * horizon.discount)?;
     let weights = step_weights(&discount)?;
     let returns = lambda_return(&reward, &value, &discount, horizon.lambda)?;
-    Ok(Imagination {
-        features,
-        actions: Tensor::stack(&actions, 0)?,
-        entropy: Tensor::stack(&entropy, 0)?,
-        reward,
-        value,
-        discount,
-        weights,
-        returns,
-    })
+    Ok(Imagination { features, actions, entropy, reward, value, discount, weights, returns })
 }

@@ -1,12 +1,17 @@
+use std::collections::BTreeMap;
+use std::ops::Range;
+
 use candle_core::Tensor;
 use rcwm_models::settings::ModelSettings;
 use serde::Serialize;
 
 use super::{BehaviourSettings, Imagination, ReturnRange, actor_loss, critic_loss, imagine};
+use crate::learning::parts::part;
 use crate::learning::{Adam, Gradients, LearningError, Trained};
 use crate::model::agent::Agent;
 use crate::model::latent::{Sampler, State};
 use crate::model::parameters::Parameters;
+use crate::ops;
 
 /// Actor, critic and its slow copy with what it takes to train them. The world model is only read: no gradient reaches it.
 #[derive(Debug, Clone)]
@@ -34,7 +39,7 @@ pub struct BehaviourGradients {
 }
 
 /// What one update of actor and critic was.
-#[derive(Debug, Clone, Copy, PartialEq, Serialize)]
+#[derive(Debug, Clone, Copy, PartialEq, Default, Serialize)]
 pub struct BehaviourUpdate {
     /// The actor's loss.
     pub actor_loss: f64,
@@ -55,6 +60,20 @@ pub struct BehaviourUpdate {
     /// What returns are divided by.
     pub return_scale: f64,
 }
+
+impl BehaviourUpdate {
+    /// Adds a share's part of every mean over rows.
+    fn add(&mut self, share: &Self) {
+        self.actor_loss += share.actor_loss;
+        self.critic_loss += share.critic_loss;
+        self.entropy += share.entropy;
+        self.reward += share.reward;
+        self.lambda_return += share.lambda_return;
+        self.value += share.value;
+    }
+}
+
+type NamedTensors = BTreeMap<String, Tensor>;
 
 impl BehaviourLearner {
     /// A learner on `parameters`, which it shares.
@@ -84,10 +103,10 @@ impl BehaviourLearner {
     /// # Errors
     /// See [`LearningError`]; actor and critic are then as they were.
     pub fn update(&mut self, start: &State, sampler: &mut Sampler) -> Result<BehaviourUpdate, LearningError> {
-        self.mix_slow_critic()?;
-        let imagined = self.imagine(start, sampler)?;
-        let gradients = self.gradients(&imagined)?;
-        self.apply(&gradients)?;
+        part("slow critic", || self.mix_slow_critic())?;
+        let imagined = self.imagine_shares(start, sampler)?;
+        let gradients = self.gradients(imagined)?;
+        part("behaviour Adam", || self.apply(&gradients))?;
         Ok(gradients.values)
     }
 
@@ -114,36 +133,88 @@ impl BehaviourLearner {
         imagine(&self.acting, start, &self.settings.horizon, sampler)
     }
 
-    /// Takes the returns into the range, then gives losses and gradients of actor and critic.
+    /// The same by all threads, each with some of the starts: their imaginations, in the starts' order. Rows know nothing of each other, so
+    /// no thread waits for another.
+    ///
+    /// # Errors
+    /// Those of candle.
+    pub fn imagine_shares(
+        &self,
+        start: &State,
+        sampler: &mut Sampler,
+    ) -> candle_core::Result<Vec<Imagination>> {
+        let rows = start.branches.first().map_or(Ok(0), |latent| latent.h.dim(0))?;
+        let whole = &*sampler;
+        let shares = ops::in_parallel(ops::shares_of(rows), |share: Range<usize>| {
+            let mut sampler = whole.share(share.clone(), rows);
+            Ok((self.imagine(&start.rows(&share)?, &mut sampler)?, sampler))
+        });
+        let shares = shares.into_iter().collect::<candle_core::Result<Vec<_>>>()?;
+        let (imagined, samplers): (Vec<_>, Vec<_>) = shares.into_iter().unzip();
+        samplers.into_iter().for_each(|share| sampler.follow(share));
+        Ok(imagined)
+    }
+
+    /// Takes the returns of all shares into the range, then gives losses and gradients of actor and critic.
     ///
     /// # Errors
     /// See [`LearningError`].
-    pub fn gradients(&mut self, imagined: &Imagination) -> Result<BehaviourGradients, LearningError> {
+    pub fn gradients(&mut self, imagined: Vec<Imagination>) -> Result<BehaviourGradients, LearningError> {
         let mut range = self.return_range;
-        range.update(&imagined.returns, &self.settings)?;
-        let actor_loss = actor_loss(imagined, range.scale(), self.settings.entropy_scale)?;
-        let critic_loss = self.critic_loss(imagined)?;
-        let of = |loss: &Tensor, trained: Trained| Gradients::of(loss, &self.parameters, trained.filter());
+        let returns: Vec<_> = imagined.iter().map(|share| &share.returns).collect();
+        let returns = Tensor::cat(&returns, 1)?; // [L-1, N, 1]
+        part("return range", || range.update(&returns, &self.settings))?;
+        let rows = returns.dim(1)?;
+        let shares = ops::in_parallel(imagined, |share| self.share_gradients(share, range, rows));
+        let (mut actors, mut critics) = (Vec::new(), Vec::new());
+        let mut values = BehaviourUpdate { return_scale: range.scale(), ..BehaviourUpdate::default() };
+        for share in shares {
+            let (actor, critic, share_values) = share?;
+            actors.push(actor);
+            critics.push(critic);
+            values.add(&share_values);
+        }
+        self.return_range = range;
+        let (actor, critic) = part("behaviour sum", || {
+            Ok::<_, LearningError>((Gradients::sum(actors)?, Gradients::sum(critics)?))
+        })?;
+        values.actor_gradient_norm = actor.norm();
+        values.critic_gradient_norm = critic.norm();
+        Ok(BehaviourGradients { actor, critic, values })
+    }
+
+    /// What a share of the `rows` imaginations adds to gradients and values; its graph is gone afterwards.
+    fn share_gradients(
+        &self,
+        imagined: Imagination,
+        range: ReturnRange,
+        rows: usize,
+    ) -> Result<(NamedTensors, NamedTensors, BehaviourUpdate), LearningError> {
+        let weight = imagined.returns.dim(1)? as f64 / rows as f64;
+        let actor_loss = actor_loss(&imagined, range.scale(), self.settings.entropy_scale)? * weight;
+        let actor_loss = actor_loss?;
+        let critic_loss = (part("critic", || self.critic_loss(&imagined))? * weight)?;
+        let of =
+            |loss: &Tensor, trained: Trained| Gradients::of_share(loss, &self.parameters, trained.filter());
         let (actor, critic) = if self.settings.actor_loss_reaches_critic {
             let both = of(&(&actor_loss + &critic_loss)?, Trained::Behaviour)?;
-            (both.part(Trained::Actor.filter())?, both.part(Trained::Critic.filter())?)
+            both.into_iter().partition(|(name, _)| Trained::Actor.filter()(name))
         } else {
-            (of(&actor_loss, Trained::Actor)?, of(&critic_loss, Trained::Critic)?)
+            let actor = part("actor backward", || of(&actor_loss, Trained::Actor))?;
+            (actor, part("critic backward", || of(&critic_loss, Trained::Critic))?)
         };
-        self.return_range = range;
-        let mean = |x: &Tensor| Ok::<_, candle_core::Error>(f64::from(x.mean_all()?.to_scalar::<f32>()?));
+        let scalar = |x: &Tensor| Ok::<_, candle_core::Error>(f64::from(x.to_scalar::<f32>()?));
+        let mean = |x: &Tensor| Ok::<_, candle_core::Error>(weight * scalar(&x.mean_all()?)?);
         let values = BehaviourUpdate {
-            actor_loss: mean(&actor_loss)?,
-            critic_loss: mean(&critic_loss)?,
-            actor_gradient_norm: actor.norm(),
-            critic_gradient_norm: critic.norm(),
+            actor_loss: scalar(&actor_loss)?,
+            critic_loss: scalar(&critic_loss)?,
             entropy: mean(&imagined.entropy)?,
             reward: mean(&imagined.reward)?,
             lambda_return: mean(&imagined.returns)?,
             value: mean(&imagined.value)?,
-            return_scale: range.scale(),
+            ..BehaviourUpdate::default()
         };
-        Ok(BehaviourGradients { actor, critic, values })
+        Ok((actor, critic, values))
     }
 
     /// The critic's loss, in which the critic alone trains.

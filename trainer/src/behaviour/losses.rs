@@ -1,7 +1,6 @@
 use candle_core::{Result, Tensor};
 
 use super::Imagination;
-use crate::learning::{cross_entropy, two_hot};
 use crate::model::heads::TwoHotHead;
 
 /// The actor's loss (eq. 11): `-mean(w_t ((R_t - v(s_t)) / scale + eta H_t))` over the first L-1 states. The gradient passes
@@ -24,11 +23,9 @@ pub fn actor_loss(imagined: &Imagination, scale: f64, entropy_scale: f64) -> Res
 pub fn critic_loss(critic: &TwoHotHead, slow: &TwoHotHead, imagined: &Imagination) -> Result<Tensor> {
     let steps = imagined.returns.dim(0)?;
     let features = imagined.features.narrow(0, 0, steps)?.detach();
-    let slow_value = slow.mean(&slow.logits(&features)?)?;
+    let slow_value = slow.mean(&slow.logits(&features)?)?.squeeze(2)?;
     let logits = critic.logits(&features)?; // [L-1, N, bins]
-    let bins = logits.dim(2)?;
-    // Both are cross-entropies of the same logits: the targets add up.
-    let target = (two_hot(&imagined.returns, bins)? + two_hot(&slow_value, bins)?)?;
-    let loss = cross_entropy(&logits, &target)?; // [L-1, N]
+    let returns = critic.logits_loss(&logits, &imagined.returns.squeeze(2)?)?; // [L-1, N]
+    let loss = (returns + critic.logits_loss(&logits, &slow_value)?)?;
     (imagined.weights.narrow(0, 0, steps)?.squeeze(2)? * loss)?.mean_all()
 }

@@ -1,10 +1,11 @@
 use std::collections::BTreeMap;
 
-use candle_core::{Result, Tensor, Var};
+use candle_core::{Result, Var};
 use serde::{Deserialize, Serialize};
 
 use super::Gradients;
 use crate::model::parameters::Parameters;
+use crate::ops::{AdamStep, adam_step};
 
 /// Adam with clipping by the global norm.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
@@ -89,7 +90,7 @@ impl Adam {
         gradients: &Gradients,
         rate: impl Fn(&str) -> f64,
     ) -> Result<()> {
-        let clip = clip_factor(gradients.norm(), self.settings.clip_norm);
+        let scale = clip_factor(gradients.norm(), self.settings.clip_norm);
         for (name, gradient) in gradients.iter() {
             let Some(parameter) = parameters.get(name) else { continue };
             if !self.moments.contains_key(name) {
@@ -99,7 +100,9 @@ impl Adam {
             }
             if let Some(moments) = self.moments.get_mut(name) {
                 moments.steps += 1;
-                move_parameter(parameter, moments, gradient, clip, rate(name), &self.settings)?;
+                let AdamSettings { eps, beta1, beta2, .. } = self.settings;
+                let step = AdamStep { number: moments.steps, scale, rate: rate(name), beta1, beta2, eps };
+                adam_step(parameter, &moments.first, &moments.second, gradient, &step)?;
             }
         }
         Ok(())
@@ -109,26 +112,4 @@ impl Adam {
 /// What gradients of this norm are multiplied with.
 fn clip_factor(norm: f64, norm_max: f64) -> f64 {
     (norm_max / (norm + 1e-6)).min(1.0)
-}
-
-/// `p -= rate * m / (1 - b1^t) / (sqrt(v / (1 - b2^t)) + eps)`.
-fn move_parameter(
-    parameter: &Var,
-    moments: &Moments,
-    gradient: &Tensor,
-    clip: f64,
-    rate: f64,
-    settings: &AdamSettings,
-) -> Result<()> {
-    let AdamSettings { eps, beta1, beta2, .. } = *settings;
-    let gradient = if clip < 1.0 { (gradient * clip)? } else { gradient.clone() };
-    let first = ((moments.first.as_tensor() * beta1)? + (&gradient * (1.0 - beta1))?)?;
-    let second = ((moments.second.as_tensor() * beta2)? + (gradient.sqr()? * (1.0 - beta2))?)?;
-    let steps = i32::try_from(moments.steps).unwrap_or(i32::MAX);
-    let (correct1, correct2) = (1.0 - beta1.powi(steps), 1.0 - beta2.powi(steps));
-    let spread = (second.sqrt()? * (1.0 / correct2.sqrt()))? + eps;
-    let change = (&first * (rate / correct1))?.div(&spread?)?;
-    moments.first.set(&first)?;
-    moments.second.set(&second)?;
-    parameter.set(&(parameter.as_tensor() - change)?.detach())
 }

@@ -1,3 +1,5 @@
+use std::ops::Range;
+
 use candle_core::{Device, Result, Tensor};
 use rcwm_models::{ACTION_LEN, IMAGE_CHANNELS, IMAGE_SIDE};
 
@@ -18,6 +20,24 @@ pub struct Batch {
     pub first: FirstSteps,
     /// 1 where the robot is, else 0: u8 or f32 [B, T, 64, 64, 1]; none when masks are not used.
     pub robot_mask: Option<Tensor>,
+}
+
+impl Batch {
+    /// Some of the sequences, without a copy of the tensors.
+    ///
+    /// # Errors
+    /// Those of candle, also if there are fewer.
+    pub fn rows(&self, rows: &Range<usize>) -> Result<Self> {
+        let part = |x: &Tensor| x.narrow(0, rows.start, rows.len());
+        Ok(Self {
+            image: part(&self.image)?,
+            action: part(&self.action)?,
+            reward: part(&self.reward)?,
+            terminal: part(&self.terminal)?,
+            first: self.first.rows(rows),
+            robot_mask: self.robot_mask.as_ref().map(part).transpose()?,
+        })
+    }
 }
 
 /// The same on the host, as replay makes it; rows first, then steps.

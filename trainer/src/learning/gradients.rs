@@ -1,9 +1,10 @@
 use std::collections::BTreeMap;
 
-use candle_core::{Tensor, backprop::GradStore};
+use candle_core::Tensor;
 
 use super::LearningError;
 use crate::model::parameters::Parameters;
+use crate::ops::sum_of_squares;
 
 /// Gradients of one loss, by the parameters' names.
 #[derive(Debug, Clone)]
@@ -22,25 +23,49 @@ impl Gradients {
         parameters: &Parameters,
         trains: fn(&str) -> bool,
     ) -> Result<Self, LearningError> {
+        Self::new(Self::of_share(loss, parameters, trains)?)
+    }
+
+    /// The same of a share of the loss, to be summed by [`Gradients::sum`].
+    ///
+    /// # Errors
+    /// Those of [`Gradients::of`].
+    pub fn of_share(
+        loss: &Tensor,
+        parameters: &Parameters,
+        trains: fn(&str) -> bool,
+    ) -> Result<BTreeMap<String, Tensor>, LearningError> {
         let value = f64::from(loss.to_scalar::<f32>()?);
         if !value.is_finite() {
             return Err(LearningError::NotFinite { what: "the loss", value });
         }
-        Self::collect(loss.backward()?, parameters, trains)
-    }
-
-    fn collect(
-        mut store: GradStore,
-        parameters: &Parameters,
-        trains: fn(&str) -> bool,
-    ) -> Result<Self, LearningError> {
+        let mut store = loss.backward()?;
         let mut tensors = BTreeMap::new();
         for (name, var) in parameters.iter().filter(|(name, _)| trains(name)) {
             let gradient =
                 store.remove(var).ok_or_else(|| LearningError::NoGradient { name: name.to_owned() })?;
             tensors.insert(name.to_owned(), gradient);
         }
-        Self::new(tensors)
+        Ok(tensors)
+    }
+
+    /// The sum over shares of a loss.
+    ///
+    /// # Errors
+    /// Those of [`Gradients::new`].
+    pub fn sum(shares: Vec<BTreeMap<String, Tensor>>) -> Result<Self, LearningError> {
+        let mut shares = shares.into_iter();
+        let mut sum = shares.next().unwrap_or_default();
+        for share in shares {
+            for (name, term) in share {
+                let total = match sum.get(&name) {
+                    Some(total) => (total + term)?,
+                    None => term,
+                };
+                sum.insert(name, total);
+            }
+        }
+        Self::new(sum)
     }
 
     /// Gradients that are known already.
@@ -50,7 +75,7 @@ impl Gradients {
     pub fn new(tensors: BTreeMap<String, Tensor>) -> Result<Self, LearningError> {
         let mut squares = 0.0;
         for gradient in tensors.values() {
-            squares += f64::from(gradient.sqr()?.sum_all()?.to_scalar::<f32>()?);
+            squares += sum_of_squares(gradient)?;
         }
         let norm = squares.sqrt();
         if !norm.is_finite() {

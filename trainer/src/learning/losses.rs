@@ -1,11 +1,12 @@
-use candle_core::{DType, Result, Tensor};
+use candle_core::{D, Result, Tensor};
 use serde::Serialize;
 
-use super::{Batch, BranchKl, WorldSettings, balanced_kl, cross_entropy, two_hot};
+use super::parts::part;
+use super::{Batch, BranchKl, WorldSettings, balanced_kl};
 use crate::model::agent::Agent;
-use crate::model::encoder::image_to_float;
 use crate::model::latent::Sampler;
 use crate::model::world::Observed;
+use crate::ops;
 
 /// The terms of the world model's loss, each a scalar before its factor, and what they came from.
 #[derive(Debug, Clone)]
@@ -58,27 +59,33 @@ pub fn world_losses(
     settings: &WorldSettings,
     sampler: &mut Sampler,
 ) -> Result<WorldLosses> {
-    let embeds = agent.world.encode(&batch.image)?;
-    let observed = agent.world.observe(&embeds, &batch.action, &batch.first, sampler)?;
-    let decoded = agent.world.decode(&observed.posteriors)?;
-    let features = observed.posteriors.features()?; // [B, T, state width]
+    let embeds = part("encode", || agent.world.encode(&batch.image))?;
+    let observed = part("observe", || agent.world.observe(&embeds, &batch.action, &batch.first, sampler))?;
+    let painted = part("decode", || {
+        agent.world.picture_loss(&observed.posteriors, &batch.image, batch.robot_mask.as_ref())
+    })?;
+    part("other losses", || other_losses(agent, batch, settings, observed, painted))
+}
 
-    let image = pixel_loss(&decoded.image, &image_to_float(&batch.image)?)?;
-    // The first picture is the robot's, and of the baseline the only one.
-    let robot_mask = match &batch.robot_mask {
-        Some(mask) => Some(pixel_loss(&decoded.pictures[0].mask, &mask.to_dtype(DType::F32)?)?),
-        None => None,
-    };
-    let reward = agent.heads.reward.logits(&features)?; // [B, T, bins]
-    let target = two_hot(&batch.reward.unsqueeze(2)?, reward.dim(2)?)?;
-    let reward = cross_entropy(&reward, &target)?.mean_all()?;
+/// Heads, divergences and the sum, from the squared errors of the pictures and the robot's masks, [B*T] each.
+fn other_losses(
+    agent: &Agent,
+    batch: &Batch,
+    settings: &WorldSettings,
+    observed: Observed,
+    painted: (Tensor, Option<Tensor>),
+) -> Result<WorldLosses> {
+    let image = painted.0.mean_all()?;
+    let robot_mask = painted.1.map(|loss| loss.mean_all()).transpose()?;
+    let features = observed.posteriors.features()?; // [B, T, state width]
+    let reward = agent.heads.reward.loss(&features, &batch.reward)?.mean_all()?;
     let continues = continue_loss(&agent.heads.continue_logit(&features)?, &batch.terminal)?;
     let branches = observed
         .posteriors
         .branches
         .iter()
         .zip(&observed.priors.branches)
-        .map(|(q, p)| balanced_kl(q, p, agent.settings.unimix, settings.free_nats))
+        .map(|(q, p)| balanced_kl(q, p, agent.settings.unimix, settings))
         .collect::<Result<Vec<_>>>()?;
 
     let mut total = ((&image * settings.image_scale)? + (&reward * settings.reward_scale)?)?;
@@ -87,15 +94,9 @@ pub fn world_losses(
         total = (total + (mask * settings.mask_scale)?)?;
     }
     for branch in &branches {
-        total = (total + (branch.dynamics.mean_all()? * settings.dynamics_scale)?)?;
-        total = (total + (branch.representation.mean_all()? * settings.representation_scale)?)?;
+        total = (total + branch.loss.mean_all()?)?;
     }
     Ok(WorldLosses { image, robot_mask, reward, continues, branches, total, observed })
-}
-
-/// Squared error of [B, T, H, W, C], summed over pixels, then the mean: a scalar.
-fn pixel_loss(found: &Tensor, target: &Tensor) -> Result<Tensor> {
-    (found - target)?.sqr()?.flatten_from(2)?.sum(2)?.mean_all()
 }
 
 /// Binary cross-entropy of the logits [B, T, 1] against going on, where not `terminal` [B, T]: a scalar. As a softmax over the
@@ -103,10 +104,53 @@ fn pixel_loss(found: &Tensor, target: &Tensor) -> Result<Tensor> {
 fn continue_loss(logit: &Tensor, terminal: &Tensor) -> Result<Tensor> {
     let logits = Tensor::cat(&[&logit.zeros_like()?, logit], 2)?; // [B, T, 2]: ends, goes on
     let target = Tensor::stack(&[terminal, &terminal.affine(-1.0, 1.0)?], 2)?;
-    cross_entropy(&logits, &target)?.mean_all()
+    (target * ops::log_softmax(&logits)?)?.sum(D::Minus1)?.mean_all()?.neg()
 }
 
 impl WorldLosses {
+    /// The same without gradient, which lets go of the graph.
+    #[must_use]
+    pub fn detached(&self) -> Self {
+        Self {
+            image: self.image.detach(),
+            robot_mask: self.robot_mask.as_ref().map(Tensor::detach),
+            reward: self.reward.detach(),
+            continues: self.continues.detach(),
+            branches: self.branches.iter().map(BranchKl::detached).collect(),
+            total: self.total.detach(),
+            observed: self.observed.detached(),
+        }
+    }
+
+    /// The losses of a batch from those of shares of its rows, each with its share of the rows.
+    ///
+    /// # Errors
+    /// Those of candle.
+    pub fn merged(shares: &[(f64, Self)]) -> Result<Self> {
+        if let [(_, all)] = shares {
+            return Ok(all.clone());
+        }
+        let sum = |scalar: fn(&Self) -> Option<&Tensor>| -> Result<Option<Tensor>> {
+            let terms = shares.iter().filter_map(|(weight, losses)| scalar(losses).map(|x| x * *weight));
+            terms.reduce(|a, b| a? + b?).transpose()
+        };
+        let all =
+            |scalar| sum(scalar)?.ok_or_else(|| candle_core::Error::Msg("losses of no rows".to_owned()));
+        let observed: Vec<_> = shares.iter().map(|(_, losses)| &losses.observed).collect();
+        let branch = |index: usize| BranchKl::cat(shares.iter().map(|(_, losses)| &losses.branches[index]));
+        Ok(Self {
+            image: all(|losses| Some(&losses.image))?,
+            robot_mask: sum(|losses| losses.robot_mask.as_ref())?,
+            reward: all(|losses| Some(&losses.reward))?,
+            continues: all(|losses| Some(&losses.continues))?,
+            branches: (0..shares.first().map_or(0, |(_, losses)| losses.branches.len()))
+                .map(branch)
+                .collect::<Result<_>>()?,
+            total: all(|losses| Some(&losses.total))?,
+            observed: Observed::cat(&observed)?,
+        })
+    }
+
     /// The plain numbers.
     ///
     /// # Errors

@@ -5,8 +5,9 @@
 //! | `settings` | everything that can be chosen, with the paper's values |
 //! | `batch` | sequences of experience as tensors |
 //! | `losses` | image, mask, reward, continuation, KL per branch (spec: losses; eq. 2, 3, 9) |
-//! | `two_hot`, `kl` | cross-entropy over bins, balanced KL with free bits |
+//! | `kl` | balanced KL with free bits, per branch |
 //! | `gradients`, `adam` | gradients by name, clipping, the optimiser |
+//! | `parts` | where the time of an update goes |
 //! | `sides` | which parameters belong to the robot's side, the environment's, the behaviour |
 //! | `world` | one update of the world model |
 
@@ -15,9 +16,9 @@ mod batch;
 mod gradients;
 mod kl;
 mod losses;
+pub mod parts;
 mod settings;
 mod sides;
-mod two_hot;
 mod world;
 
 pub use adam::{Adam, AdamSettings, Moments};
@@ -27,7 +28,6 @@ pub use kl::{BranchKl, balanced_kl};
 pub use losses::{LossValues, WorldLosses, world_losses};
 pub use settings::WorldSettings;
 pub use sides::{Side, Trained, side_of};
-pub use two_hot::{cross_entropy, two_hot};
 pub use world::{WorldLearner, WorldUpdate};
 
 use crate::model::parameters::ParameterError;

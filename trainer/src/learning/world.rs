@@ -1,5 +1,8 @@
+use std::ops::Range;
+
 use rcwm_models::settings::ModelSettings;
 
+use super::parts::part;
 use super::{
     Adam, Batch, Gradients, LearningError, LossValues, Side, Trained, WorldLosses, WorldSettings, side_of,
     world_losses,
@@ -7,6 +10,7 @@ use super::{
 use crate::model::agent::Agent;
 use crate::model::latent::{Sampler, State};
 use crate::model::parameters::Parameters;
+use crate::ops;
 
 /// The world model with what it takes to train it.
 #[derive(Debug, Clone)]
@@ -74,12 +78,39 @@ impl WorldLearner {
         world_losses(&self.agent, batch, &self.settings, sampler)
     }
 
-    /// Gradients of the total loss in what is trained.
+    /// The losses of a batch, without their graph, and the gradients of the total in what is trained.
+    ///
+    /// The threads share the sequences among themselves, and each goes its whole way forth and back alone: in the scan over
+    /// time there is too little to do at once for threads to help each other.
     ///
     /// # Errors
     /// See [`Gradients::of`].
-    pub fn gradients(&self, losses: &WorldLosses) -> Result<Gradients, LearningError> {
-        Gradients::of(&losses.total, &self.parameters, self.trained.filter())
+    pub fn gradients(
+        &self,
+        batch: &Batch,
+        sampler: &mut Sampler,
+    ) -> Result<(WorldLosses, Gradients), LearningError> {
+        let (rows, whole) = (batch.first.batch(), &*sampler);
+        let share = |rows_here: Range<usize>| {
+            let mut sampler = whole.share(rows_here.clone(), rows);
+            let weight = rows_here.len() as f64 / rows as f64;
+            let losses = self.losses(&batch.rows(&rows_here)?, &mut sampler)?;
+            let gradients = part("world backward", || {
+                Gradients::of_share(&(&losses.total * weight)?, &self.parameters, self.trained.filter())
+            })?;
+            Ok::<_, LearningError>(((weight, losses.detached()), gradients, sampler))
+        };
+        let shares = ops::in_parallel(ops::shares_of(rows), share);
+        let (mut losses, mut gradients) = (Vec::new(), Vec::new());
+        let mut followed = None;
+        for share in shares {
+            let (share_losses, share_gradients, share_sampler) = share?;
+            losses.push(share_losses);
+            gradients.push(share_gradients);
+            followed = Some(share_sampler);
+        }
+        followed.into_iter().for_each(|share| sampler.follow(share));
+        part("world sum", || Ok((WorldLosses::merged(&losses)?, Gradients::sum(gradients)?)))
     }
 
     /// Moves the parameters.
@@ -100,13 +131,12 @@ impl WorldLearner {
     /// # Errors
     /// See [`LearningError`]; the parameters are then as they were.
     pub fn update(&mut self, batch: &Batch, sampler: &mut Sampler) -> Result<WorldUpdate, LearningError> {
-        let losses = self.losses(batch, sampler)?;
-        let gradients = self.gradients(&losses)?;
-        self.apply(&gradients)?;
+        let (losses, gradients) = self.gradients(batch, sampler)?;
+        part("world Adam", || self.apply(&gradients))?;
         Ok(WorldUpdate {
             losses: losses.values()?,
             gradient_norm: gradients.norm(),
-            posteriors: losses.observed.posteriors.map(|x| Ok(x.detach()))?,
+            posteriors: losses.observed.posteriors,
         })
     }
 }

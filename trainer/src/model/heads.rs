@@ -36,6 +36,22 @@ impl TwoHotHead {
         self.mlp.forward(features)
     }
 
+    /// Cross-entropy of the prediction from `features` [..., state width] with the two-hot distributions of `values` [...]: [...].
+    ///
+    /// # Errors
+    /// Those of candle.
+    pub fn loss(&self, features: &Tensor, values: &Tensor) -> Result<Tensor> {
+        self.logits_loss(&self.logits(features)?, values)
+    }
+
+    /// [`TwoHotHead::loss`] of logits [..., bins].
+    ///
+    /// # Errors
+    /// Those of candle.
+    pub fn logits_loss(&self, logits: &Tensor, values: &Tensor) -> Result<Tensor> {
+        ops::two_hot_loss(logits, &self.bins, &ops::symlog(&values.detach())?)
+    }
+
     /// Mean of the distribution given by logits [..., bins]: [..., 1].
     ///
     /// # Errors

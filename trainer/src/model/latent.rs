@@ -1,9 +1,12 @@
 //! Latent states, where episodes begin in them, and the noise that draws them.
 
+use std::ops::Range;
+
 use candle_core::{D, Device, Result, Tensor};
 use rand::{Rng, SeedableRng};
 use rand_chacha::ChaCha8Rng;
-use rand_distr::{Gumbel, StandardNormal};
+
+use crate::ops;
 
 /// One branch's latent state s = [z, h], with the logits its z came from.
 #[derive(Debug, Clone)]
@@ -38,11 +41,18 @@ impl Latent {
     /// # Errors
     /// Those of candle.
     pub fn stack<'a>(latents: impl Iterator<Item = &'a Self>, dim: usize) -> Result<Self> {
+        Self::join(latents, |tensors| Tensor::stack(tensors, dim))
+    }
+
+    fn join<'a>(
+        latents: impl Iterator<Item = &'a Self>,
+        join: impl Fn(&[&Tensor]) -> Result<Tensor>,
+    ) -> Result<Self> {
         let latents: Vec<_> = latents.collect();
-        let stack = |field: fn(&Self) -> &Tensor| {
-            Tensor::stack(&latents.iter().map(|latent| field(latent)).collect::<Vec<_>>(), dim)
+        let join = |field: fn(&Self) -> &Tensor| {
+            join(&latents.iter().map(|latent| field(latent)).collect::<Vec<_>>())
         };
-        Ok(Self { z: stack(|l| &l.z)?, h: stack(|l| &l.h)?, logits: stack(|l| &l.logits)? })
+        Ok(Self { z: join(|l| &l.z)?, h: join(|l| &l.h)?, logits: join(|l| &l.logits)? })
     }
 }
 
@@ -72,14 +82,45 @@ impl State {
         Ok(Self { branches })
     }
 
+    /// Without gradient, which lets go of the graph.
+    #[must_use]
+    pub fn detached(&self) -> Self {
+        let branch = |latent: &Latent| Latent {
+            z: latent.z.detach(),
+            h: latent.h.detach(),
+            logits: latent.logits.detach(),
+        };
+        Self { branches: self.branches.iter().map(branch).collect() }
+    }
+
+    /// Some of the rows.
+    ///
+    /// # Errors
+    /// Those of candle, also if there are fewer.
+    pub fn rows(&self, rows: &Range<usize>) -> Result<Self> {
+        self.map(|x| x.narrow(0, rows.start, rows.len()))
+    }
+
     /// States side by side along a new dimension.
     ///
     /// # Errors
     /// Those of candle.
     pub fn stack(states: &[Self], dim: usize) -> Result<Self> {
+        Self::join(states, |tensors| Tensor::stack(tensors, dim))
+    }
+
+    /// States one after the other along their first dimension.
+    ///
+    /// # Errors
+    /// Those of candle.
+    pub fn cat(states: &[Self]) -> Result<Self> {
+        Self::join(states, |tensors| Tensor::cat(tensors, 0))
+    }
+
+    fn join(states: &[Self], join: impl Fn(&[&Tensor]) -> Result<Tensor>) -> Result<Self> {
         let branches = states.first().map_or(0, |state| state.branches.len());
-        let stack = |index: usize| Latent::stack(states.iter().map(|state| &state.branches[index]), dim);
-        Ok(Self { branches: (0..branches).map(stack).collect::<Result<_>>()? })
+        let join = |index: usize| Latent::join(states.iter().map(|state| &state.branches[index]), &join);
+        Ok(Self { branches: (0..branches).map(join).collect::<Result<_>>()? })
     }
 }
 
@@ -110,6 +151,16 @@ impl FirstSteps {
     pub fn new(flags: Vec<bool>, length: usize) -> Self {
         assert!(length > 0 && flags.len().is_multiple_of(length), "flags must be whole rows");
         Self { flags, length }
+    }
+
+    /// Some of the rows.
+    ///
+    /// # Panics
+    /// If there are fewer; a programming error.
+    #[must_use]
+    pub fn rows(&self, rows: &Range<usize>) -> Self {
+        let flags = self.flags[rows.start * self.length..rows.end * self.length].to_vec();
+        Self { flags, length: self.length }
     }
 
     /// B.
@@ -184,14 +235,25 @@ pub enum Sampler {
     /// No noise: categoricals give their mode, actions their mean.
     Mode,
     /// The trainer's generator.
-    Seeded(Box<ChaCha8Rng>),
+    Seeded(Box<Noise>),
+}
+
+/// A generator whose numbers are drawn for the rows of a batch. Whoever works on some of the rows draws what these rows would
+/// get if all were drawn, so that the noise does not depend on how a batch is shared out.
+#[derive(Debug, Clone)]
+pub struct Noise {
+    generator: ChaCha8Rng,
+    /// The rows that are worked on here.
+    rows: Range<usize>,
+    /// All rows of the batch.
+    total: usize,
 }
 
 impl Sampler {
     /// A sampler whose draws repeat with the seed.
     #[must_use]
     pub fn seeded(seed: u64) -> Self {
-        Self::Seeded(Box::new(ChaCha8Rng::seed_from_u64(seed)))
+        Self::numbered(seed, 0)
     }
 
     /// The sampler of one numbered step of training: seed and number say all, so there is no state to save.
@@ -199,7 +261,25 @@ impl Sampler {
     pub fn numbered(seed: u64, number: u64) -> Self {
         let mut generator = ChaCha8Rng::seed_from_u64(seed);
         generator.set_stream(number);
-        Self::Seeded(Box::new(generator))
+        Self::Seeded(Box::new(Noise { generator, rows: 0..1, total: 1 }))
+    }
+
+    /// The sampler for some of the `total` rows of a batch, whose tensors all have the rows first.
+    #[must_use]
+    pub fn share(&self, rows: Range<usize>, total: usize) -> Self {
+        match self {
+            Self::Mode => Self::Mode,
+            Self::Seeded(noise) => {
+                Self::Seeded(Box::new(Noise { generator: noise.generator.clone(), rows, total }))
+            }
+        }
+    }
+
+    /// Goes on where a share of it has got to.
+    pub fn follow(&mut self, share: Self) {
+        if let (Self::Seeded(noise), Self::Seeded(share)) = (self, share) {
+            noise.generator = share.generator;
+        }
     }
 
     /// Standard Gumbel noise of this shape; none for the mode.
@@ -207,8 +287,7 @@ impl Sampler {
     /// # Errors
     /// Those of candle.
     pub fn gumbel(&mut self, shape: &[usize], device: &Device) -> Result<Option<Tensor>> {
-        let gumbel = Gumbel::new(0f32, 1f32).map_err(candle_core::Error::wrap)?;
-        self.draw(shape, device, |generator| generator.sample(gumbel))
+        self.draw(shape, device, 1, ops::gumbel)
     }
 
     /// Standard normal noise of this shape; none for the mean.
@@ -216,23 +295,32 @@ impl Sampler {
     /// # Errors
     /// Those of candle.
     pub fn normal(&mut self, shape: &[usize], device: &Device) -> Result<Option<Tensor>> {
-        self.draw(shape, device, |generator| generator.sample(StandardNormal))
+        self.draw(shape, device, 2, ops::normal)
     }
 
     fn draw(
         &mut self,
         shape: &[usize],
         device: &Device,
-        sample: impl Fn(&mut ChaCha8Rng) -> f32,
+        words_per_number: usize,
+        noise: fn(&[u32]) -> Vec<f32>,
     ) -> Result<Option<Tensor>> {
-        match self {
-            Self::Mode => Ok(None),
-            Self::Seeded(generator) => {
-                let count = shape.iter().product();
-                let values: Vec<f32> = (0..count).map(|_| sample(generator)).collect();
-                Tensor::from_vec(values, shape, device).map(Some)
-            }
-        }
+        let Self::Seeded(source) = self else { return Ok(None) };
+        let words = source.words(words_per_number * shape.iter().product::<usize>());
+        Tensor::from_vec(noise(&words), shape, device).map(Some)
+    }
+}
+
+impl Noise {
+    /// This many words for the rows here; passes over those of the others.
+    fn words(&mut self, count: usize) -> Vec<u32> {
+        let each = (count / self.rows.len().max(1)) as u128;
+        let start = self.generator.get_word_pos();
+        let mut words = vec![0; count];
+        self.generator.set_word_pos(start + each * self.rows.start as u128);
+        self.generator.fill(words.as_mut_slice());
+        self.generator.set_word_pos(start + each * self.total as u128);
+        words
     }
 }
 
@@ -252,6 +340,27 @@ mod tests {
         assert_eq!(at(0), [[0.0, 0.0], [0.0, 0.0]]);
         assert_eq!(at(1), [[1.0, 1.0], [1.0, 1.0]]);
         assert_eq!(at(2), [[0.0, 0.0], [1.0, 1.0]]);
+    }
+
+    #[test]
+    fn shares_of_a_batch_draw_what_the_whole_batch_draws() {
+        let device = Device::Cpu;
+        let numbers = |x: Option<Tensor>| x.unwrap().flatten_all().unwrap().to_vec1::<f32>().unwrap();
+        let draw = |sampler: &mut Sampler, rows: usize| {
+            let gumbel = numbers(sampler.gumbel(&[rows, 3, 7], &device).unwrap());
+            (gumbel, numbers(sampler.normal(&[rows, 4], &device).unwrap()))
+        };
+        let mut whole = Sampler::numbered(5, 2);
+        let mut shares = [whole.share(0..2, 5), whole.share(2..5, 5)];
+        for _ in 0..2 {
+            let expected = draw(&mut whole, 5);
+            let (first, second) = (draw(&mut shares[0], 2), draw(&mut shares[1], 3));
+            assert_eq!(([first.0, second.0].concat(), [first.1, second.1].concat()), expected);
+        }
+        let [share, _] = shares;
+        let mut other = Sampler::numbered(5, 2);
+        other.follow(share);
+        assert_eq!(draw(&mut other, 5), draw(&mut whole, 5));
     }
 
     #[test]

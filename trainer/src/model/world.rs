@@ -20,6 +20,34 @@ pub struct Observed {
     pub interaction: Option<Tensor>,
 }
 
+impl Observed {
+    /// Without gradient, which lets go of the graph.
+    #[must_use]
+    pub fn detached(&self) -> Self {
+        Self {
+            priors: self.priors.detached(),
+            posteriors: self.posteriors.detached(),
+            interaction: self.interaction.as_ref().map(Tensor::detach),
+        }
+    }
+
+    /// Rows after rows.
+    ///
+    /// # Errors
+    /// Those of candle.
+    pub fn cat(shares: &[&Self]) -> Result<Self> {
+        let states = |field: fn(&Self) -> &State| {
+            State::cat(&shares.iter().map(|share| field(share).clone()).collect::<Vec<_>>())
+        };
+        let interactions: Vec<_> = shares.iter().filter_map(|share| share.interaction.as_ref()).collect();
+        Ok(Self {
+            priors: states(|share| &share.priors)?,
+            posteriors: states(|share| &share.posteriors)?,
+            interaction: if interactions.is_empty() { None } else { Some(Tensor::cat(&interactions, 0)?) },
+        })
+    }
+}
+
 /// Pictures of a state.
 #[derive(Debug, Clone)]
 pub struct Decoded {

@@ -268,6 +268,9 @@ impl Backward for Kept {
 
     fn backward(&self, grads: &[Option<Tensor>], wanted: &[bool]) -> Result<Vec<Option<Tensor>>> {
         let [Some(grad)] = grads else { return Ok(vec![None; wanted.len()]) };
+        if !wanted.contains(&true) {
+            return Ok(vec![None; wanted.len()]);
+        }
         let batch = self.x.dim(0)?;
         let shares = self.shares(batch);
         let first = self.maps[0].len();

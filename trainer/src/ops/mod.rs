@@ -24,7 +24,9 @@ mod conv_pass;
 mod conv_stack;
 mod kernels;
 mod linear;
+mod memory;
 mod node;
+mod noise;
 mod norm;
 mod painted;
 mod picture;
@@ -37,7 +39,7 @@ mod check;
 mod oracle_tests;
 
 pub use activation::{log_softmax, sigmoid, softmax};
-pub use adam::{Adam, AdamSettings, AdamState};
+pub use adam::{AdamStep, adam_step, sum_of_squares};
 pub use attention::cross_attention;
 pub use categorical::{
     KlBalance, balanced_kl, entropy, log_probs, one_hot_of_best, probs, straight_through_mode,
@@ -46,8 +48,10 @@ pub use categorical::{
 pub use cell::{recurrent_cell, recurrent_update};
 pub use conv::{conv_down, conv_down_stack, conv_up, conv_up_stack};
 pub use conv_stack::ConvLayer;
-pub use kernels::parallel::leave_threads_to_ops;
+pub use kernels::parallel::{in_parallel, leave_threads_to_ops, shares_of};
 pub use linear::linear;
+pub use memory::{keep_freed_memory, return_freed_memory};
+pub use noise::{gumbel, normal};
 pub use norm::{layer_norm, layer_norm_silu};
 pub use painted::painted_loss;
 pub use picture::{image_to_float, picture_loss};

@@ -17,6 +17,7 @@ pub(super) struct Updates {
 
 struct WorldStep {
     losses: WorldLosses,
+    free_nats: f64,
     gradients: Gradients,
     updated: Parameters,
 }
@@ -32,19 +33,18 @@ impl Updates {
         let updated = parameters(reference, device)?;
         let settings = WorldSettings { reward_scale: reference.reward_scale, ..WorldSettings::default() };
         let mut learner = WorldLearner::new(&updated, &reference.settings, &settings, Trained::World)?;
-        let losses = learner.losses(&batch, &mut Sampler::Mode)?;
-        let gradients = learner.gradients(&losses)?;
+        let (losses, gradients) = learner.gradients(&batch, &mut Sampler::Mode)?;
         learner.apply(&resolved(reference, &gradients, device)?)?;
         // The behaviour's update has the original weights, its own copy of them.
         let start = losses.observed.posteriors.map(|x| x.detach().flatten(0, 1))?; // [B*T, ...]
-        let world = WorldStep { losses, gradients, updated };
+        let world = WorldStep { losses, free_nats: settings.free_nats, gradients, updated };
 
         let updated = parameters(reference, device)?;
         let mut learner =
             BehaviourLearner::new(&updated, &reference.settings, &behaviour_settings(reference))?;
         learner.mix_slow_critic()?;
-        let imagined = learner.imagine(&start, &mut Sampler::Mode)?;
-        let gradients = learner.gradients(&imagined)?;
+        let imagined = learner.imagine_shares(&start, &mut Sampler::Mode)?;
+        let gradients = learner.gradients(imagined)?;
         learner.apply(&gradients)?;
         Ok(Self { world, behaviour: BehaviourStep { gradients, updated } })
     }
@@ -91,8 +91,10 @@ impl Updates {
         }
         for (branch, kl) in ["robot", "environment"].into_iter().zip(&losses.branches) {
             named.push((format!("{branch}_kl"), kl.kl.clone()));
-            named.push((format!("{branch}_dynamics"), kl.dynamics.mean_all()?.reshape(1)?));
-            named.push((format!("{branch}_representation"), kl.representation.mean_all()?.reshape(1)?));
+            // The halves differ in their gradients only.
+            let clipped = kl.kl.maximum(self.world.free_nats)?.mean_all()?.reshape(1)?;
+            named.push((format!("{branch}_dynamics"), clipped.clone()));
+            named.push((format!("{branch}_representation"), clipped));
         }
         Ok(named)
     }

@@ -62,9 +62,11 @@ impl Client {
                     }
                     _ => return Ok(Some(observation)),
                 },
-                Wait::TimedOut => self.check()?,
+                // It may have said goodbye before this end was connected.
+                Wait::TimedOut if !self.is_running()? => return Ok(None),
+                Wait::TimedOut => {}
                 Wait::Closed => {
-                    self.check()?;
+                    self.is_running()?;
                     return Ok(None);
                 }
             }
@@ -72,8 +74,9 @@ impl Client {
         Ok(None)
     }
 
-    fn check(&mut self) -> Result<(), ClientError> {
-        Ok(self.process.as_mut().map_or(Ok(()), SimulatorProcess::check)?)
+    /// Nothing is known of a simulator that was joined: it counts as running.
+    fn is_running(&mut self) -> Result<bool, ClientError> {
+        Ok(self.process.as_mut().map_or(Ok(true), SimulatorProcess::is_running)?)
     }
 
     /// Answers the observation of this sequence.

@@ -186,11 +186,11 @@ impl SimulatorProcess {
         &self.instance
     }
 
-    /// Whether it still runs, or has ended well.
+    /// Whether it still runs; otherwise it has ended well.
     ///
     /// # Errors
     /// [`ProcessError::Ended`] with its last words if it failed.
-    pub fn check(&mut self) -> Result<(), ProcessError> {
+    pub fn is_running(&mut self) -> Result<bool, ProcessError> {
         let name = Program::SIMULATOR.name;
         match self.child.try_wait() {
             Ok(Some(status)) if !status.success() => Err(ProcessError::Ended {
@@ -199,7 +199,7 @@ impl SimulatorProcess {
                 status,
                 last_words: self.last_words(),
             }),
-            Ok(_) => Ok(()),
+            Ok(status) => Ok(status.is_none()),
             Err(source) => Err(ProcessError::Wait { name, instance: self.instance.clone(), source }),
         }
     }
@@ -216,10 +216,14 @@ impl SimulatorProcess {
         text.lines().rev().find(|line| !line.trim().is_empty()).unwrap_or("it said nothing").trim().to_owned()
     }
 
+    fn is_gone(&mut self) -> bool {
+        !matches!(self.child.try_wait(), Ok(None))
+    }
+
     fn wait(&mut self, longest: Duration) -> bool {
         let start = Instant::now();
         while start.elapsed() < longest {
-            if !matches!(self.child.try_wait(), Ok(None)) {
+            if self.is_gone() {
                 return true;
             }
             std::thread::sleep(Duration::from_millis(10));
@@ -236,7 +240,7 @@ fn in_own_group(command: &mut Command) {
 
 impl Drop for SimulatorProcess {
     fn drop(&mut self) {
-        if self.wait(Duration::ZERO) || !matches!(self.child.try_wait(), Ok(None)) {
+        if self.is_gone() {
             return;
         }
         if let Some(pid) = i32::try_from(self.child.id()).ok().and_then(Pid::from_raw) {

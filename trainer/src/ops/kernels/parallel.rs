@@ -1,12 +1,43 @@
 //! Work in fixed shares on a few threads: the same number of threads gives the same bits.
 
+use std::cell::Cell;
 use std::ops::Range;
 use std::sync::OnceLock;
 
-/// Threads that work together, the caller included; `RAYON_NUM_THREADS` limits them.
+thread_local! {
+    /// Threads that a task may use, where it is one of several.
+    static GRANTED: Cell<Option<usize>> = const { Cell::new(None) };
+}
+
+/// Threads that work together, the caller included; `RAYON_NUM_THREADS` limits them, and so does [`in_parallel`] within its tasks.
 pub fn threads() -> usize {
     static THREADS: OnceLock<usize> = OnceLock::new();
-    *THREADS.get_or_init(|| candle_core::utils::get_num_threads().max(1))
+    GRANTED.get().unwrap_or_else(|| *THREADS.get_or_init(|| candle_core::utils::get_num_threads().max(1)))
+}
+
+/// Runs `body` on every item at the same time, and gives the results in the items' order. The tasks divide the threads among
+/// themselves: with as many items as threads, each runs on one alone, ops included, and waits for no other until the end.
+///
+/// # Panics
+/// If `body` does.
+pub fn in_parallel<I: Send, T: Send>(items: Vec<I>, body: impl Fn(I) -> T + Sync) -> Vec<T> {
+    let granted = (threads() / items.len().max(1)).max(1);
+    let mut results: Vec<Option<T>> = items.iter().map(|_| None).collect();
+    let body = &body;
+    let tasks = items.into_iter().zip(&mut results).map(|(item, result)| {
+        move || {
+            let before = GRANTED.replace(Some(granted));
+            *result = Some(body(item));
+            GRANTED.set(before);
+        }
+    });
+    run(tasks.collect());
+    results.into_iter().map(|result| result.expect("every task has run to its end")).collect()
+}
+
+/// Shares of `count` items for [`in_parallel`]: one a thread, none empty.
+pub fn shares_of(count: usize) -> Vec<Range<usize>> {
+    shares(count, 1)
 }
 
 /// Leaves the cores to the fused ops: candle's own elementwise operations then run on the calling thread. Its pool spins between
@@ -82,6 +113,14 @@ mod tests {
             );
             assert!(shares.len() == 1 || shares.iter().all(|share| share.len() >= least));
         }
+    }
+
+    #[test]
+    fn tasks_give_their_results_in_order_and_divide_the_threads() {
+        let all = threads();
+        let found = in_parallel(shares_of(5), |share| (share.start, threads()));
+        assert!(found.is_sorted() && found.iter().all(|(_, granted)| granted * found.len() <= all.max(1)));
+        assert_eq!(threads(), all);
     }
 
     #[test]
