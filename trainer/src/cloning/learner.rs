@@ -79,8 +79,8 @@ impl CloningLearner {
         let mut imagined = None;
         if imagination_weight > 0.0 {
             self.imagining.mix_slow_critic()?;
-            let imagination = self.imagining.imagine(&start()?, sampler)?;
-            let gradients = self.imagining.gradients(&imagination)?;
+            let imaginations = self.imagining.imagine_shares(&start()?, sampler)?;
+            let gradients = self.imagining.gradients(imaginations)?;
             actor = sum(&actor, &gradients.actor, imagination_weight)?;
             self.critic_adam.step(&self.parameters, &gradients.critic)?;
             imagined = Some(gradients.values);
