@@ -6,6 +6,8 @@
 //! | [`model`] | RCWM and the vanilla baseline |
 //! | [`learning`] | losses, gradients and updates of the world model |
 //! | [`behaviour`] | imagination with the actor, returns, actor and critic updates |
+//! | [`acting`] | the policy in simulators while it learns |
+//! | [`cloning`] | the actor from demonstrations |
 //! | [`replay`] | experience in memory, batches drawn from it |
 //! | [`simulators`] | Meta-World processes: started, joined, recorded |
 //! | [`training`] | runs: phases, metrics, checkpoints, resuming |
@@ -17,8 +19,10 @@
 //!
 //! This crate never depends on tract or pyo3.
 
+pub mod acting;
 pub mod behaviour;
 pub mod checkpoint;
+pub mod cloning;
 pub mod evaluation;
 pub mod export;
 pub mod learning;

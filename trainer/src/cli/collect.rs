@@ -123,7 +123,7 @@ impl Collect {
 /// Episodes of one simulator in a row: loading Meta-World takes about as long as two of them.
 const EPISODES_A_RUN: u64 = 30;
 
-fn bar(episodes: u64, steps_max: u32) -> Result<ProgressBar> {
+pub(super) fn bar(episodes: u64, steps_max: u32) -> Result<ProgressBar> {
     let steps = episodes.saturating_mul(u64::from(steps_max) + 1);
     let template = "{wide_bar} {pos}/{len} steps, {per_sec}, ETA {eta}, {msg} episodes";
     let bar = ProgressBar::new(steps).with_style(ProgressStyle::with_template(template)?).with_message("0");
@@ -131,7 +131,7 @@ fn bar(episodes: u64, steps_max: u32) -> Result<ProgressBar> {
     Ok(bar)
 }
 
-fn advance(bar: &ProgressBar, seen: Seen) {
+pub(super) fn advance(bar: &ProgressBar, seen: Seen) {
     match seen {
         Seen::Step => bar.inc(1),
         Seen::Episode => {

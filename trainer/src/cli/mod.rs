@@ -1,12 +1,17 @@
 //! The command line, one file per verb.
 
+mod bars;
 mod collect;
 mod evaluate;
 mod export;
+mod fewshot;
+mod finetune;
 mod init;
+mod online;
 mod parameters;
 mod parity;
 mod pretrain;
+mod train;
 
 use std::path::Path;
 use std::process::ExitCode;
@@ -35,6 +40,9 @@ enum Verb {
     Export(export::Export),
     Evaluate(evaluate::Evaluate),
     Pretrain(pretrain::Pretrain),
+    Fewshot(fewshot::Fewshot),
+    Finetune(finetune::Finetune),
+    Train(train::Train),
 }
 
 impl Arguments {
@@ -48,6 +56,9 @@ impl Arguments {
             Verb::Export(verb) => verb.run(),
             Verb::Evaluate(verb) => verb.run(),
             Verb::Pretrain(verb) => verb.run(),
+            Verb::Fewshot(verb) => verb.run(),
+            Verb::Finetune(verb) => verb.run(),
+            Verb::Train(verb) => verb.run(),
         }
     }
 }

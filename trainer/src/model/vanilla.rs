@@ -14,7 +14,8 @@ use super::world::{Decoded, Observed, at_step, normalised_action, sequence};
 #[derive(Debug, Clone)]
 pub struct Vanilla {
     encoder: ConvStack,
-    branch: Branch,
+    /// The recurrent part.
+    pub branch: Branch,
     /// Its picture.
     pub decoder: Decoder,
 }

@@ -103,6 +103,31 @@ impl Folder {
         self.files.is_empty()
     }
 
+    /// Lists the episodes of one task: those in `path/task` if there is such a folder, else all that is in `path`.
+    ///
+    /// # Errors
+    /// [`LoadError::Folder`] or [`LoadError::NoEpisodes`].
+    pub fn list_task(path: &Path, task: &str) -> Result<Self, LoadError> {
+        let own = path.join(task);
+        Self::list(if !task.is_empty() && own.is_dir() { &own } else { path }, None)
+    }
+
+    /// Reads the episodes one by one, in order, with their tasks and files.
+    pub fn episodes(&self) -> impl Iterator<Item = Result<(&str, &Path, Episode), LoadError>> {
+        self.files.iter().map(|(task, path)| Ok((task.as_str(), path.as_path(), self.read(task, path)?)))
+    }
+
+    fn read(&self, task: &str, path: &Path) -> Result<Episode, LoadError> {
+        let mut episode = Episode::read(path)?;
+        if let Some(masks) = &self.masks {
+            let folder = masks.join(task).join(path.file_stem().unwrap_or_default());
+            if folder.is_dir() {
+                episode.robot_mask = Some(read_masks(&folder, episode.len())?);
+            }
+        }
+        Ok(episode)
+    }
+
     /// Reads every episode into a replay of this capacity in steps; `seen` hears of each.
     ///
     /// # Errors
@@ -122,16 +147,10 @@ impl Folder {
         mut seen: impl FnMut(),
     ) -> Result<Replay, LoadError> {
         let mut replay = Replay::new(capacity);
-        for (task, path) in &self.files {
-            let mut episode = Episode::read(path)?;
-            if let Some(masks) = &self.masks {
-                let folder = masks.join(task).join(path.file_stem().unwrap_or_default());
-                if folder.is_dir() {
-                    episode.robot_mask = Some(read_masks(&folder, episode.len())?);
-                }
-            }
+        for read in self.episodes() {
+            let (task, path, episode) = read?;
             if keep(&episode) {
-                let refused = |source| LoadError::Refused { path: path.clone(), source };
+                let refused = |source| LoadError::Refused { path: path.to_path_buf(), source };
                 replay.add(task, episode).map_err(refused)?;
             }
             seen();

@@ -14,8 +14,10 @@
 mod held_out;
 mod load;
 mod prefetch;
+mod shared;
 mod store;
 
 pub use load::{Folder, LoadError};
 pub use prefetch::{Prefetch, PrefetchError};
+pub use shared::SharedReplay;
 pub use store::{Replay, ReplayError, append_steps};

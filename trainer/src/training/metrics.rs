@@ -1,4 +1,5 @@
 use serde::Serialize;
+use serde_json::Value;
 
 use crate::learning::LossValues;
 
@@ -30,33 +31,32 @@ pub struct HeldOutLosses {
     pub best: bool,
 }
 
-impl Metrics {
-    /// Every number under its name for TensorBoard.
-    pub(super) fn scalars(&self) -> Vec<(String, f64)> {
-        let mut scalars = loss_scalars("losses", &self.losses);
-        scalars.push(("gradient_norm".to_owned(), self.gradient_norm));
-        scalars.push(("speed/updates_per_second".to_owned(), self.updates_per_second));
-        scalars.push(("speed/waiting_share".to_owned(), self.waiting_share));
-        scalars
+/// The numbers of a line under their names for TensorBoard, `losses/image`; the number of updates is their step, not one of them.
+pub(super) fn scalars(line: &Value) -> Vec<(String, f64)> {
+    let mut scalars = Vec::new();
+    let fields = line.as_object().into_iter().flatten();
+    fields.filter(|(name, _)| *name != "update").for_each(|(name, value)| gather(name, value, &mut scalars));
+    scalars
+}
+
+fn gather(name: &str, value: &Value, scalars: &mut Vec<(String, f64)>) {
+    match value {
+        Value::Object(fields) => {
+            fields.iter().for_each(|(field, value)| gather(&format!("{name}/{field}"), value, scalars));
+        }
+        value => scalars.extend(value.as_f64().map(|number| (name.to_owned(), number))),
     }
 }
 
-impl HeldOutLosses {
-    /// Every number under its name for TensorBoard.
-    pub(super) fn scalars(&self) -> Vec<(String, f64)> {
-        loss_scalars("held_out", &self.held_out)
-    }
-}
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use serde_json::json;
 
-fn loss_scalars(group: &str, losses: &LossValues) -> Vec<(String, f64)> {
-    let always = [
-        ("total", Some(losses.total)),
-        ("image", Some(losses.image)),
-        ("robot_mask", losses.robot_mask),
-        ("reward", Some(losses.reward)),
-        ("continue", Some(losses.continues)),
-        ("robot_kl", Some(losses.robot_kl)),
-        ("environment_kl", losses.environment_kl),
-    ];
-    always.into_iter().filter_map(|(name, value)| Some((format!("{group}/{name}"), value?))).collect()
+    #[test]
+    fn numbers_at_any_depth_are_scalars_and_nothing_else_is() {
+        let line =
+            json!({"update": 7, "phase": "mask_free", "losses": {"image": 1.5, "mask": null}, "rate": 2});
+        assert_eq!(scalars(&line), [("losses/image".to_owned(), 1.5), ("rate".to_owned(), 2.0)]);
+    }
 }

@@ -27,30 +27,52 @@
 //! | `curves` | the metrics as a picture |
 //! | `film` | films of the open loop |
 //! | `held_out` | the loss on episodes that are not trained on |
-//! | `pretrain` | the phase: mask warm-up, then mask-free updates |
+//! | `pretrain` | the first phase: mask warm-up, then mask-free updates |
+//! | `phases` | what can be chosen for the phases that learn a task |
+//! | `reset` | what such a phase starts from |
+//! | `demonstrations`, `fewshot` | a task from recorded successes alone |
+//! | `prefill`, `finetune` | acting and learning, after pre-training or from scratch |
+//! | `averages` | their lines of metrics |
 
+mod averages;
 mod curves;
+mod demonstrations;
+mod fewshot;
 mod film;
+mod finetune;
 mod held_out;
 mod metrics;
+mod phases;
+mod prefill;
 mod pretrain;
+mod reset;
 mod run;
 mod settings;
 mod state;
 mod tensorboard;
 
+pub use averages::{Averages, Interval, Line, Spent};
+pub use demonstrations::demonstrations;
+pub use fewshot::{Fewshot, Stage};
 pub use film::{FilmSettings, film};
+pub use finetune::{EpisodeFacts, EpisodeLine, Finetuning, OnlineOutcome, OnlineProgress};
 pub use metrics::{HeldOutLosses, Metrics};
+pub use phases::{FewshotSettings, FinetuneSettings, Phase};
+pub use prefill::{Prefilled, episodes_folder, prefill};
 pub use pretrain::{Outcome, Pretraining, Progress};
+pub use reset::{Reset, ResetSettings, start_from};
 pub use run::{Best, Run};
 pub use settings::{PretrainSettings, ReplaySettings, TrainingSettings};
 pub use state::{StateError, TrainingState};
 
+use crate::acting::FleetError;
 use crate::checkpoint::CheckpointError;
 use crate::learning::LearningError;
 use crate::model::parameters::ParameterError;
 use crate::plots::PlotError;
 use crate::replay::{LoadError, PrefetchError, ReplayError};
+use crate::simulators::CollectError;
+use rcwm_models::episode::EpisodeError;
 use rcwm_models::files::FileError;
 use rcwm_models::settings::SettingsError;
 use std::path::PathBuf;
@@ -71,6 +93,26 @@ pub enum TrainingError {
         path: PathBuf,
         /// What is missing.
         file: &'static str,
+    },
+    /// The folder holds a run of another kind.
+    #[error("{path} holds a run of {found}; resume it with `rcwm-trainer {found} --resume`")]
+    OtherPhase {
+        /// The folder.
+        path: PathBuf,
+        /// What made it.
+        found: &'static str,
+    },
+    /// No demonstration is among the data.
+    #[error(
+        "none of the {episodes} episodes of {task} in {path} was successful; record some: rcwm-trainer collect --task {task} --expert 50"
+    )]
+    NoDemonstrations {
+        /// Where was looked.
+        path: PathBuf,
+        /// The task.
+        task: String,
+        /// Episodes that were looked at.
+        episodes: usize,
     },
     /// A resumed run would have another model.
     #[error("the model's sizes differ from those of the run's checkpoint; a resumed run keeps its model")]
@@ -107,6 +149,15 @@ pub enum TrainingError {
     /// An update failed.
     #[error(transparent)]
     Learning(#[from] LearningError),
+    /// Acting in simulators failed.
+    #[error(transparent)]
+    Acting(#[from] FleetError),
+    /// Episodes could not be collected.
+    #[error(transparent)]
+    Collect(#[from] CollectError),
+    /// An episode could not be written.
+    #[error(transparent)]
+    Episode(#[from] EpisodeError),
     /// Data could not be loaded.
     #[error(transparent)]
     Load(#[from] LoadError),

@@ -181,7 +181,7 @@ impl Pretraining {
         let line = held_out.map(|held_out| HeldOutLosses { update, held_out, best: best == Best::Yes });
         // Before the checkpoint: who dies in between loses both, because a resumed run drops lines beyond its checkpoint.
         if let Some(line) = &line {
-            self.run.log_held_out(line)?;
+            self.run.log(line)?;
         }
         let optimisers = [(WORLD, self.learner.adam())];
         self.run.save(&self.parameters, &self.settings, &self.state, &optimisers, best)?;

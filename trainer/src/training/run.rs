@@ -6,8 +6,9 @@ use candle_core::Device;
 use rcwm_models::files::{read_capped, write_atomic};
 use serde::{Deserialize, Serialize};
 
+use super::metrics::scalars;
 use super::tensorboard::EventFile;
-use super::{HeldOutLosses, Metrics, TrainingError, TrainingSettings, TrainingState, curves};
+use super::{TrainingError, TrainingSettings, TrainingState, curves};
 use crate::checkpoint::{self, Checkpoint, CheckpointSettings};
 use crate::learning::Adam;
 use crate::model::parameters::Parameters;
@@ -33,6 +34,12 @@ pub enum Best {
     Yes,
     /// It is not.
     No,
+}
+
+impl From<bool> for Best {
+    fn from(is_best: bool) -> Self {
+        if is_best { Self::Yes } else { Self::No }
+    }
 }
 
 impl Run {
@@ -108,32 +115,16 @@ impl Run {
         Self::last(folder).join(checkpoint::SETTINGS_FILE).exists()
     }
 
-    /// Appends a line of metrics.
+    /// Appends a line of metrics: an object that tells the `update` it was written after. Its numbers go to TensorBoard too.
     ///
     /// # Errors
     /// Those of writing.
-    pub fn log(&mut self, metrics: &Metrics) -> Result<(), TrainingError> {
-        self.append(metrics, metrics.update, &metrics.scalars())
-    }
-
-    /// Appends a line on the held-out episodes.
-    ///
-    /// # Errors
-    /// Those of writing.
-    pub fn log_held_out(&mut self, losses: &HeldOutLosses) -> Result<(), TrainingError> {
-        self.append(losses, losses.update, &losses.scalars())
-    }
-
-    fn append(
-        &mut self,
-        line: &impl Serialize,
-        update: u64,
-        scalars: &[(String, f64)],
-    ) -> Result<(), TrainingError> {
-        let mut line = serde_json::to_vec(line)?;
-        line.push(b'\n');
-        self.metrics.write_all(&line).map_err(failed(&self.folder.join(METRICS_FILE)))?;
-        self.events.scalars(update, scalars).map_err(failed(self.events.path()))
+    pub fn log(&mut self, line: &impl Serialize) -> Result<(), TrainingError> {
+        let line = serde_json::to_value(line)?;
+        let update = line["update"].as_u64().unwrap_or_default();
+        let text = format!("{line}\n");
+        self.metrics.write_all(text.as_bytes()).map_err(failed(&self.folder.join(METRICS_FILE)))?;
+        self.events.scalars(update, &scalars(&line)).map_err(failed(self.events.path()))
     }
 
     /// Draws the curves of everything that was logged.

@@ -3,7 +3,7 @@ use std::path::PathBuf;
 use rcwm_models::settings::{ModelKind, ModelSettings, Preset, SettingsError};
 use serde::{Deserialize, Serialize};
 
-use super::FilmSettings;
+use super::{FewshotSettings, FilmSettings, FinetuneSettings, Phase, ResetSettings};
 use crate::behaviour::BehaviourSettings;
 use crate::learning::WorldSettings;
 
@@ -11,12 +11,21 @@ use crate::learning::WorldSettings;
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct TrainingSettings {
+    /// What the run is.
+    #[serde(default)]
+    pub phase: Phase,
     /// Sizes the run started from: `debug`, `small`, `paper`, or `custom` where the model was changed.
     pub preset: String,
     /// Seed of everything that is drawn.
     pub seed: u64,
     /// Folder of the episodes, `task/*.npz`.
     pub data: PathBuf,
+    /// Folder of the checkpoint that the weights came from; empty for a run from scratch.
+    #[serde(default)]
+    pub from: PathBuf,
+    /// The task that is learned; empty for all that the data has.
+    #[serde(default)]
+    pub task: String,
     /// Folder of masks as pictures, `task/episode/*.png`; empty where the episodes' own masks are used.
     #[serde(default)]
     pub masks: PathBuf,
@@ -43,6 +52,15 @@ pub struct TrainingSettings {
     /// The pre-training phase.
     #[serde(default)]
     pub pretrain: PretrainSettings,
+    /// What a new task starts from.
+    #[serde(default)]
+    pub reset: ResetSettings,
+    /// Learning from demonstrations alone.
+    #[serde(default)]
+    pub fewshot: FewshotSettings,
+    /// Acting and learning.
+    #[serde(default)]
+    pub finetune: FinetuneSettings,
 }
 
 fn metrics_every() -> u64 {
@@ -122,9 +140,12 @@ impl TrainingSettings {
             Preset::Paper => ("paper", paper, PretrainSettings::default()),
         };
         Self {
+            phase: Phase::Pretrain,
             preset: name.to_owned(),
             seed: 0,
             data,
+            from: PathBuf::new(),
+            task: String::new(),
             masks: PathBuf::new(),
             metrics_every: metrics_every(),
             checkpoint_every: checkpoint_every(),
@@ -134,6 +155,9 @@ impl TrainingSettings {
             replay,
             film: FilmSettings::default(),
             pretrain,
+            reset: ResetSettings::default(),
+            fewshot: FewshotSettings::preset(preset),
+            finetune: FinetuneSettings::preset(preset),
         }
     }
 
@@ -167,6 +191,7 @@ impl TrainingSettings {
             ("world.adam", &self.world.adam),
             ("behaviour.actor", &self.behaviour.actor),
             ("behaviour.critic", &self.behaviour.critic),
+            ("fewshot.cloning.actor", &self.fewshot.cloning.actor),
         ] {
             let positive = |x: f64| x.is_finite() && x > 0.0;
             let decays = |x: f64| (0.0..1.0).contains(&x);
@@ -176,7 +201,8 @@ impl TrainingSettings {
                 return Err(SettingsError::Invalid(format!("{name}: found {adam:?}, expected {expected}")));
             }
         }
-        Ok(())
+        self.fewshot.validate()?;
+        self.finetune.validate()
     }
 }
 

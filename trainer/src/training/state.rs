@@ -66,10 +66,20 @@ pub struct TrainingState {
     /// Lowest loss on the held-out episodes; none before the first, or where none are held out.
     #[serde(default)]
     pub best_held_out_loss: Option<f64>,
+    /// Highest success rate at a checkpoint of a run that acts; none before the first.
+    #[serde(default)]
+    pub best_success: Option<f64>,
+    /// Steps that the policy has made.
+    #[serde(default)]
+    pub policy_steps: u64,
+    /// Episodes that the policy has finished.
+    #[serde(default)]
+    pub episodes: u64,
     /// The returns' average range.
     pub return_range: ReturnRange,
     /// Steps of every parameter's optimiser, by optimiser and name.
-    pub steps: BTreeMap<String, u64>,
+    #[serde(rename = "steps")]
+    pub optimiser_steps: BTreeMap<String, u64>,
 }
 
 /// The file that goes with these weights. Its name ties it to them: a checkpoint's settings name the weights, and whoever dies
@@ -96,7 +106,7 @@ impl TrainingState {
                 let key = format!("{optimiser}/{name}");
                 arrays.insert(format!("{key}/first"), bytes(&moments.first)?);
                 arrays.insert(format!("{key}/second"), bytes(&moments.second)?);
-                state.steps.insert(key, moments.steps);
+                state.optimiser_steps.insert(key, moments.steps);
             }
         }
         let views = arrays
@@ -152,7 +162,7 @@ impl TrainingState {
         parameters: &Parameters,
     ) -> Result<Adam, StateError> {
         let mut moments = BTreeMap::new();
-        for (key, steps) in &self.steps {
+        for (key, steps) in &self.optimiser_steps {
             let Some(name) = key.strip_prefix(optimiser).and_then(|rest| rest.strip_prefix('/')) else {
                 continue;
             };

@@ -1,0 +1,317 @@
+use std::path::Path;
+use std::sync::Arc;
+use std::sync::atomic::{AtomicBool, Ordering};
+
+use candle_core::{Device, Tensor};
+use rcwm_models::episode::Episode;
+use rcwm_models::settings::ModelKind;
+use serde_json::json;
+
+use super::{
+    Best, FewshotSettings, Interval, Line, Outcome, Phase, Run, Spent, TrainingError, TrainingSettings,
+    TrainingState, start_from,
+};
+use crate::checkpoint::Checkpoint;
+use crate::cloning::{CloningLearner, Examples, state_of_features};
+use crate::learning::{Trained, WorldLearner};
+use crate::model::agent::Agent;
+use crate::model::latent::Sampler;
+use crate::model::parameters::Parameters;
+use crate::replay::{Prefetch, Replay};
+
+/// Names of the optimisers in checkpoints.
+const OPTIMISERS: [&str; 3] = ["world", "actor", "critic"];
+/// What sets the streams of draws apart under one seed.
+const REPLAY_STREAM: u64 = 0x7265_706c_6179;
+const EXAMPLES_STREAM: u64 = 0x0065_7861_6d70;
+const ROWS_STREAM: u64 = 0x0072_6f77_7300;
+
+/// What an update of few-shot learning trains.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum Stage {
+    /// The environment's side alone.
+    Environment,
+    /// The whole world model.
+    World,
+    /// The actor.
+    Actor,
+}
+
+impl Stage {
+    /// The stage of update `number`, from 0, and the number within it.
+    #[must_use]
+    pub fn of(settings: &FewshotSettings, number: u64) -> (Self, u64) {
+        let (environment, world) = (settings.environment_updates, settings.world_updates);
+        if number < environment {
+            (Self::Environment, number)
+        } else if number < environment + world {
+            (Self::World, number - environment)
+        } else {
+            (Self::Actor, number - environment - world)
+        }
+    }
+
+    /// Its name in metrics.
+    #[must_use]
+    pub const fn name(self) -> &'static str {
+        match self {
+            Self::Environment => "environment",
+            Self::World => "world",
+            Self::Actor => "actor",
+        }
+    }
+
+    /// What of the world model it trains.
+    fn trained(self, kind: ModelKind) -> Trained {
+        match (self, kind) {
+            (Self::Environment, ModelKind::Rcwm) => Trained::Environment,
+            _ => Trained::World,
+        }
+    }
+}
+
+/// A new task from demonstrations alone: see [`FewshotSettings`].
+#[derive(Debug)]
+pub struct Fewshot {
+    settings: TrainingSettings,
+    device: Device,
+    run: Run,
+    parameters: Parameters,
+    world: WorldLearner,
+    cloning: CloningLearner,
+    state: TrainingState,
+}
+
+impl Fewshot {
+    /// A new run in `folder`, from a pre-trained model.
+    ///
+    /// # Errors
+    /// See [`TrainingError`].
+    pub fn create(
+        folder: &Path,
+        settings: TrainingSettings,
+        source: &Checkpoint,
+        device: &Device,
+    ) -> Result<Self, TrainingError> {
+        settings.validate()?;
+        if source.settings.model != settings.model {
+            return Err(TrainingError::OtherModel);
+        }
+        let run = Run::create(folder, &settings)?;
+        Self::fresh(run, settings, source, device)
+    }
+
+    fn fresh(
+        run: Run,
+        settings: TrainingSettings,
+        source: &Checkpoint,
+        device: &Device,
+    ) -> Result<Self, TrainingError> {
+        let parameters = start_from(source, &settings.reset, settings.seed, device)?;
+        Self::of(run, settings, parameters, TrainingState::default(), device)
+    }
+
+    fn of(
+        run: Run,
+        settings: TrainingSettings,
+        parameters: Parameters,
+        state: TrainingState,
+        device: &Device,
+    ) -> Result<Self, TrainingError> {
+        let model = &settings.model;
+        let world = WorldLearner::new(&parameters, model, &settings.world, Trained::World)?;
+        let cloning =
+            CloningLearner::new(&parameters, model, &settings.fewshot.cloning, &settings.behaviour)?;
+        Ok(Self { settings, device: device.clone(), run, parameters, world, cloning, state })
+    }
+
+    /// Goes on with the run in `folder` from its newest checkpoint, or from the beginning if there is none yet.
+    ///
+    /// # Errors
+    /// See [`TrainingError`].
+    pub fn resume(folder: &Path, settings: TrainingSettings, device: &Device) -> Result<Self, TrainingError> {
+        settings.validate()?;
+        if settings.phase != Phase::Fewshot {
+            let found = settings.phase.verb();
+            return Err(TrainingError::OtherPhase { path: folder.to_path_buf(), found });
+        }
+        if !Run::has_checkpoint(folder) {
+            let source = Checkpoint::read(&settings.from, device)?;
+            return Self::fresh(Run::resume(folder, &settings, 0)?, settings, &source, device);
+        }
+        let (checkpoint, state, moments) = Run::load(folder, device)?;
+        if checkpoint.settings.model != settings.model {
+            return Err(TrainingError::OtherModel);
+        }
+        let run = Run::resume(folder, &settings, state.updates)?;
+        let mut this = Self::of(run, settings, checkpoint.parameters, state, device)?;
+        let adam = |name: &str, settings| this.state.optimiser(name, settings, &moments, &this.parameters);
+        let [world, actor, critic] = OPTIMISERS;
+        *this.world.adam_mut() = adam(world, &this.settings.world.adam)?;
+        let actor = adam(actor, &this.settings.fewshot.cloning.actor)?;
+        let critic = adam(critic, &this.settings.behaviour.critic)?;
+        this.cloning.resume(actor, critic, this.state.return_range);
+        Ok(this)
+    }
+
+    /// Updates made so far.
+    #[must_use]
+    pub fn updates(&self) -> u64 {
+        self.state.updates
+    }
+
+    /// The parameters, as they are.
+    #[must_use]
+    pub fn parameters(&self) -> &Parameters {
+        &self.parameters
+    }
+
+    /// Learns from the demonstrations in `replay` until all updates are made or `stop` is set; either way ends with a checkpoint.
+    ///
+    /// # Errors
+    /// See [`TrainingError`]; the newest checkpoint is then the last good one.
+    pub fn run(
+        &mut self,
+        replay: Replay,
+        stop: &AtomicBool,
+        mut show: impl FnMut(u64, Option<&Line>),
+    ) -> Result<Outcome, TrainingError> {
+        let total = self.settings.fewshot.updates();
+        let episodes: Vec<_> = replay.tasks().flat_map(|(_, episodes)| episodes).cloned().collect();
+        let mut work = Work { batches: None, replay, examples: None, stage: None };
+        let mut interval = Interval::begin();
+        let mut saved_at = None;
+        while self.state.updates < total && !stop.load(Ordering::Relaxed) {
+            let (stage, number) = Stage::of(&self.settings.fewshot, self.state.updates);
+            if work.stage != Some(stage) {
+                self.enter(stage, &mut work, &episodes)?;
+            }
+            self.update(stage, number, &mut work, &mut interval)?;
+            self.state.updates += 1;
+            let updates = self.state.updates;
+            let line = updates
+                .is_multiple_of(self.settings.metrics_every)
+                .then(|| interval.end(updates, stage.name()));
+            if let Some(line) = &line {
+                self.run.log(line)?;
+            }
+            if updates.is_multiple_of(self.settings.checkpoint_every) {
+                self.save()?;
+                saved_at = Some(updates);
+            }
+            show(updates, line.as_ref());
+        }
+        if saved_at != Some(self.state.updates) {
+            self.save()?;
+        }
+        Ok(Outcome { updates: self.state.updates, interrupted: self.state.updates < total })
+    }
+
+    /// Prepares what the stage needs.
+    fn enter(
+        &mut self,
+        stage: Stage,
+        work: &mut Work,
+        episodes: &[Arc<Episode>],
+    ) -> Result<(), TrainingError> {
+        work.stage = Some(stage);
+        self.world.train(stage.trained(self.settings.model.kind))?;
+        let fewshot = &self.settings.fewshot;
+        let seed = self.settings.seed;
+        if stage != Stage::Actor || fewshot.world_goes_on {
+            if work.batches.is_none() {
+                let (sizes, replay) = (self.settings.replay.clone(), work.replay.clone());
+                work.batches = Some(Prefetch::start(self.state.updates, sizes.prefetch, move |number| {
+                    replay.draw(sizes.batch, sizes.length, false, seed ^ REPLAY_STREAM, number)
+                })?);
+            }
+            return Ok(());
+        }
+        work.batches = None;
+        let agent = Agent::new(&self.parameters.frozen(), &self.settings.model)?;
+        let draws = fewshot.cloning.draws;
+        work.examples =
+            Some(Examples::filter(&agent, episodes, draws, seed ^ EXAMPLES_STREAM, &self.device)?);
+        Ok(())
+    }
+
+    fn update(
+        &mut self,
+        stage: Stage,
+        number: u64,
+        work: &mut Work,
+        interval: &mut Interval,
+    ) -> Result<(), TrainingError> {
+        let mut sampler = Sampler::numbered(self.settings.seed, self.state.updates);
+        if let (Stage::Actor, Some(examples)) = (stage, &work.examples) {
+            return self.clone_from_examples(number, examples, &mut sampler, interval);
+        }
+        let batches = work.batches.as_mut().expect("entering a stage that draws batches starts them");
+        let batch = interval.time(Spent::WaitingForBatches, || batches.next_batch())?;
+        let first = batch.first.clone();
+        let batch = batch.into_tensors(&self.device)?;
+        let update = interval.time(Spent::Learning, || self.world.update(&batch, &mut sampler))?;
+        let losses = json!({"losses": update.losses, "gradient_norm": update.gradient_norm});
+        if stage == Stage::Actor {
+            let examples = Examples::of_batch(&update.posteriors.features()?, &batch.action, &first)?;
+            return self.clone_from_batch(number, examples, losses, &mut sampler, interval);
+        }
+        interval.update(&losses);
+        Ok(())
+    }
+
+    fn clone_from_examples(
+        &mut self,
+        number: u64,
+        examples: &Examples,
+        sampler: &mut Sampler,
+        interval: &mut Interval,
+    ) -> Result<(), TrainingError> {
+        let settings = &self.settings.fewshot.cloning;
+        let (rows, starts) = (settings.rows, settings.imagination_rows);
+        let seed = self.settings.seed ^ ROWS_STREAM;
+        let update = interval.time(Spent::Learning, || {
+            let (features, actions) = examples.draw(rows.max(starts), seed, self.state.updates)?;
+            let start = || state_of_features(&features.narrow(0, 0, starts)?, &self.settings.model);
+            let (few, taken) = (features.narrow(0, 0, rows)?, actions.narrow(0, 0, rows)?);
+            self.cloning.update(number, &few, &taken, start, sampler)
+        })?;
+        interval.update(&json!({"cloning": update}));
+        Ok(())
+    }
+
+    /// The actor learns from the batch that the world model has just learned from.
+    fn clone_from_batch(
+        &mut self,
+        number: u64,
+        (features, actions): (Tensor, Tensor),
+        mut values: serde_json::Value,
+        sampler: &mut Sampler,
+        interval: &mut Interval,
+    ) -> Result<(), TrainingError> {
+        let starts = self.settings.fewshot.cloning.imagination_rows.min(features.dim(0)?);
+        let update = interval.time(Spent::Learning, || {
+            let start = || state_of_features(&features.narrow(0, 0, starts)?, &self.settings.model);
+            self.cloning.update(number, &features, &actions, start, sampler)
+        })?;
+        values["cloning"] = json!(update);
+        interval.update(&values);
+        Ok(())
+    }
+
+    fn save(&mut self) -> Result<(), TrainingError> {
+        self.state.return_range = self.cloning.return_range();
+        let [actor, critic] = self.cloning.adams();
+        let [world_name, actor_name, critic_name] = OPTIMISERS;
+        let optimisers = [(world_name, self.world.adam()), (actor_name, actor), (critic_name, critic)];
+        self.run.save(&self.parameters, &self.settings, &self.state, &optimisers, Best::No)
+    }
+}
+
+/// What the present stage works on.
+struct Work {
+    replay: Replay,
+    stage: Option<Stage>,
+    batches: Option<Prefetch>,
+    examples: Option<Examples>,
+}

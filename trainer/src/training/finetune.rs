@@ -1,0 +1,495 @@
+use std::collections::VecDeque;
+use std::path::{Path, PathBuf};
+use std::sync::atomic::{AtomicBool, Ordering};
+
+use candle_core::Device;
+use serde::Serialize;
+use serde_json::json;
+
+use super::prefill::{Prefilled, policy_episode, prefill};
+use super::{Interval, Line, Phase, Run, Spent, TrainingError, TrainingSettings, TrainingState, start_from};
+use crate::acting::{Fleet, Gathered, Policy, Recorded, Seen as Sight};
+use crate::behaviour::BehaviourLearner;
+use crate::checkpoint::Checkpoint;
+use crate::learning::{Trained, WorldLearner};
+use crate::model::agent::{self, Agent};
+use crate::model::latent::Sampler;
+use crate::model::parameters::{ParameterError, Parameters};
+use crate::replay::{Prefetch, SharedReplay};
+use crate::simulators::{Launch, Seen};
+
+/// Names of the optimisers in checkpoints.
+const OPTIMISERS: [&str; 3] = ["world", "actor", "critic"];
+/// What sets the streams of draws apart under one seed.
+const REPLAY_STREAM: u64 = 0x7265_706c_6179;
+const ACTING_STREAM: u64 = 0x0061_6374_696e;
+/// Numbers of the policy's episodes, and with them their layouts, begin behind those of the scripts; each simulator has its own.
+const FIRST_EPISODE: u64 = 3_000_000;
+const EPISODES_A_SIMULATOR: u64 = 1_000_000;
+/// Steps of the environment in one decision of the policy.
+const ACTION_REPEAT: u64 = 2;
+
+/// One episode of the policy, as a line of metrics tells it.
+#[derive(Debug, Clone, PartialEq, Serialize)]
+pub struct EpisodeLine {
+    /// Updates made when it ended.
+    pub update: u64,
+    /// `online`.
+    pub phase: &'static str,
+    /// The episode.
+    pub episode: EpisodeFacts,
+}
+
+/// How an episode of the policy went.
+#[derive(Debug, Clone, PartialEq, Serialize)]
+pub struct EpisodeFacts {
+    /// Episodes that the policy has finished, this one included.
+    pub number: u64,
+    /// Which simulator.
+    pub simulator: usize,
+    /// Whether the task was solved at any step.
+    pub success: bool,
+    /// Sum of the rewards.
+    #[serde(rename = "return")]
+    pub total_reward: f64,
+    /// Decisions in it.
+    pub steps: u64,
+    /// Decisions that the policy has made in all.
+    pub policy_steps: u64,
+    /// Steps of the environment that these were.
+    pub environment_steps: u64,
+}
+
+/// Where a run stands, for whoever shows it.
+#[derive(Debug, Clone)]
+pub struct OnlineProgress<'a> {
+    /// Updates made.
+    pub updates: u64,
+    /// Decisions that the policy has made.
+    pub policy_steps: u64,
+    /// The newest line of metrics, when there is a new one.
+    pub line: Option<&'a Line>,
+    /// The episode that has just ended.
+    pub episode: Option<&'a EpisodeLine>,
+    /// Share of successes in the newest episodes; none before the first.
+    pub success_rate: Option<f64>,
+}
+
+/// How a run ended.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct OnlineOutcome {
+    /// Updates made in all.
+    pub updates: u64,
+    /// Decisions made in all.
+    pub policy_steps: u64,
+    /// Episodes finished in all.
+    pub episodes: u64,
+    /// Share of successes in the newest episodes.
+    pub success_rate: Option<f64>,
+    /// Actions that were not finite, and zeros in their place.
+    pub refused_actions: u64,
+    /// Whether it was stopped before its end; it can be resumed.
+    pub interrupted: bool,
+}
+
+/// Acting and learning on one task: see [`super::FinetuneSettings`]. Fine-tuning and training from scratch differ in what they start
+/// from only.
+///
+/// Simulators compute while the model learns: the policy answers all of them, and then as many updates are made as the train ratio
+/// says are due. A resumed run has its weights, optimisers, counters and replay back; the simulators begin new episodes, and steps
+/// since the checkpoint count as not made, although their whole episodes are replayed.
+#[derive(Debug)]
+pub struct Finetuning {
+    settings: TrainingSettings,
+    device: Device,
+    folder: PathBuf,
+    run: Run,
+    parameters: Parameters,
+    world: WorldLearner,
+    behaviour: BehaviourLearner,
+    state: TrainingState,
+    newest: VecDeque<bool>,
+    refused_actions: u64,
+}
+
+impl Finetuning {
+    /// A new run in `folder`, from a model or from scratch.
+    ///
+    /// # Errors
+    /// See [`TrainingError`].
+    pub fn create(
+        folder: &Path,
+        settings: TrainingSettings,
+        source: Option<&Checkpoint>,
+        device: &Device,
+    ) -> Result<Self, TrainingError> {
+        settings.validate()?;
+        if source.is_some_and(|source| source.settings.model != settings.model) {
+            return Err(TrainingError::OtherModel);
+        }
+        let run = Run::create(folder, &settings)?;
+        Self::fresh(folder, run, settings, source, device)
+    }
+
+    fn fresh(
+        folder: &Path,
+        run: Run,
+        settings: TrainingSettings,
+        source: Option<&Checkpoint>,
+        device: &Device,
+    ) -> Result<Self, TrainingError> {
+        let parameters = match source {
+            Some(source) => start_from(source, &settings.reset, settings.seed, device)?,
+            None => agent::initialise(&settings.model, settings.seed, device)?,
+        };
+        Self::of(folder, run, settings, parameters, TrainingState::default(), device)
+    }
+
+    fn of(
+        folder: &Path,
+        run: Run,
+        settings: TrainingSettings,
+        parameters: Parameters,
+        state: TrainingState,
+        device: &Device,
+    ) -> Result<Self, TrainingError> {
+        let world = WorldLearner::new(&parameters, &settings.model, &settings.world, Trained::World)?;
+        let behaviour = BehaviourLearner::new(&parameters, &settings.model, &settings.behaviour)?;
+        Ok(Self {
+            settings,
+            device: device.clone(),
+            folder: folder.to_path_buf(),
+            run,
+            parameters,
+            world,
+            behaviour,
+            state,
+            newest: VecDeque::new(),
+            refused_actions: 0,
+        })
+    }
+
+    /// Goes on with the run in `folder` from its newest checkpoint, or from the beginning if there is none yet.
+    ///
+    /// # Errors
+    /// See [`TrainingError`].
+    pub fn resume(folder: &Path, settings: TrainingSettings, device: &Device) -> Result<Self, TrainingError> {
+        settings.validate()?;
+        if !matches!(settings.phase, Phase::Finetune | Phase::Train) {
+            let found = settings.phase.verb();
+            return Err(TrainingError::OtherPhase { path: folder.to_path_buf(), found });
+        }
+        if !Run::has_checkpoint(folder) {
+            let source = match settings.phase {
+                Phase::Finetune => Some(Checkpoint::read(&settings.from, device)?),
+                _ => None,
+            };
+            let run = Run::resume(folder, &settings, 0)?;
+            return Self::fresh(folder, run, settings, source.as_ref(), device);
+        }
+        let (checkpoint, state, moments) = Run::load(folder, device)?;
+        if checkpoint.settings.model != settings.model {
+            return Err(TrainingError::OtherModel);
+        }
+        let run = Run::resume(folder, &settings, state.updates)?;
+        let mut this = Self::of(folder, run, settings, checkpoint.parameters, state, device)?;
+        let adam = |name: &str, settings| this.state.optimiser(name, settings, &moments, &this.parameters);
+        let [world, actor, critic] = OPTIMISERS;
+        *this.world.adam_mut() = adam(world, &this.settings.world.adam)?;
+        let actor = adam(actor, &this.settings.behaviour.actor)?;
+        let critic = adam(critic, &this.settings.behaviour.critic)?;
+        this.behaviour.resume(actor, critic, this.state.return_range);
+        Ok(this)
+    }
+
+    /// What has been done so far.
+    #[must_use]
+    pub fn state(&self) -> &TrainingState {
+        &self.state
+    }
+
+    /// The parameters, as they are.
+    #[must_use]
+    pub fn parameters(&self) -> &Parameters {
+        &self.parameters
+    }
+
+    /// Fills the replay, see [`prefill`].
+    ///
+    /// # Errors
+    /// Those of [`prefill`].
+    pub fn prefill(
+        &mut self,
+        stop: &AtomicBool,
+        seen: &(dyn Fn(Seen) + Sync),
+    ) -> Result<Prefilled, TrainingError> {
+        prefill(&self.folder, &self.settings, stop, seen)
+    }
+
+    /// Acts and learns until all steps are made, every simulator has ended, or `stop` is set; any way ends with a checkpoint.
+    ///
+    /// # Errors
+    /// See [`TrainingError`]; the newest checkpoint is then the last good one.
+    pub fn run(
+        &mut self,
+        filled: Prefilled,
+        join: &[String],
+        stop: &AtomicBool,
+        mut show: impl FnMut(&OnlineProgress<'_>),
+    ) -> Result<OnlineOutcome, TrainingError> {
+        let most = self.settings.finetune.success_episodes;
+        self.newest = filled.policy_successes.iter().rev().take(most).rev().copied().collect();
+        let replay = SharedReplay::new(filled.replay);
+        let mut learning = Learning { batches: self.prefetch(&replay)?, interval: Interval::begin() };
+        let done = self.work(&replay, &mut learning, join, stop, &mut show);
+        // Whatever happened: a model with a number that is not finite is never saved.
+        check_finite(&self.parameters)?;
+        self.save()?;
+        done?;
+        Ok(OnlineOutcome {
+            updates: self.state.updates,
+            policy_steps: self.state.policy_steps,
+            episodes: self.state.episodes,
+            success_rate: self.success_rate(),
+            refused_actions: self.refused_actions,
+            interrupted: self.state.policy_steps < self.settings.finetune.steps,
+        })
+    }
+
+    fn work(
+        &mut self,
+        replay: &SharedReplay,
+        learning: &mut Learning,
+        join: &[String],
+        stop: &AtomicBool,
+        show: &mut impl FnMut(&OnlineProgress<'_>),
+    ) -> Result<(), TrainingError> {
+        self.learn(learning, stop, show)?; // the warm-up
+        let steps = self.settings.finetune.steps;
+        if stop.load(Ordering::Relaxed) || self.state.policy_steps >= steps {
+            return Ok(());
+        }
+        let mut fleet = Fleet::new(&self.launches(), join)?;
+        let agent = Agent::new(&self.parameters.frozen(), &self.settings.model)?;
+        let mut policy = Policy::new(agent, fleet.len(), &self.device);
+        while self.state.policy_steps < steps && !stop.load(Ordering::Relaxed) {
+            let gathered = learning.interval.time(Spent::WaitingForSimulators, || fleet.gather(stop))?;
+            if gathered.is_empty() {
+                break;
+            }
+            let begin = std::time::Instant::now();
+            self.act(&gathered, &mut fleet, &mut policy)?;
+            for one in &gathered {
+                if let Some(recorded) = fleet.record(one)? {
+                    self.keep(recorded, replay, show)?;
+                }
+            }
+            learning.interval.add(Spent::Acting, begin.elapsed());
+            drop(gathered);
+            self.learn(learning, stop, show)?;
+        }
+        Ok(())
+    }
+
+    /// Answers every observation; the last of an episode by zeros, which nobody executes.
+    fn act(
+        &mut self,
+        gathered: &[Gathered],
+        fleet: &mut Fleet,
+        policy: &mut Policy,
+    ) -> Result<(), TrainingError> {
+        let going_on: Vec<_> = gathered.iter().filter(|one| !one.is_last()).collect();
+        let seen: Vec<_> = going_on.iter().map(|one| sight(one)).collect();
+        let mut sampler = Sampler::numbered(self.settings.seed ^ ACTING_STREAM, self.state.policy_steps);
+        let decisions = policy.decide(&seen, &mut sampler)?;
+        for (one, decision) in going_on.into_iter().zip(&decisions) {
+            fleet.answer(one, decision.action)?;
+        }
+        for one in gathered.iter().filter(|one| one.is_last()) {
+            fleet.answer(one, [0.0; rcwm_models::ACTION_LEN])?;
+        }
+        self.state.policy_steps += gathered.iter().filter(|one| !one.is_first()).count() as u64;
+        let refused = decisions.iter().filter(|decision| decision.refused).count() as u64;
+        self.refused_actions += refused;
+        if refused > 0 {
+            check_finite(&self.parameters)?;
+        }
+        Ok(())
+    }
+
+    /// Keeps an episode: on disk, in the replay, in the metrics.
+    fn keep(
+        &mut self,
+        recorded: Recorded,
+        replay: &SharedReplay,
+        show: &mut impl FnMut(&OnlineProgress<'_>),
+    ) -> Result<(), TrainingError> {
+        let Recorded { simulator, episode } = recorded;
+        let path = policy_episode(&self.folder, &self.settings.task, self.state.policy_steps, simulator);
+        if let Some(folder) = path.parent() {
+            std::fs::create_dir_all(folder)
+                .map_err(|source| TrainingError::Folder { path: folder.to_path_buf(), source })?;
+        }
+        episode.write(&path)?;
+        self.state.episodes += 1;
+        self.newest.push_back(episode.succeeded());
+        if self.newest.len() > self.settings.finetune.success_episodes {
+            self.newest.pop_front();
+        }
+        let facts = EpisodeFacts {
+            number: self.state.episodes,
+            simulator,
+            success: episode.succeeded(),
+            total_reward: episode.total_reward(),
+            steps: episode.len() as u64 - 1,
+            policy_steps: self.state.policy_steps,
+            environment_steps: ACTION_REPEAT * self.state.policy_steps,
+        };
+        replay.add(&self.settings.task, episode)?;
+        let line = EpisodeLine { update: self.state.updates, phase: ONLINE, episode: facts };
+        self.run.log(&line)?;
+        show(&OnlineProgress { episode: Some(&line), ..self.progress() });
+        Ok(())
+    }
+
+    /// Makes the updates that are due.
+    fn learn(
+        &mut self,
+        learning: &mut Learning,
+        stop: &AtomicBool,
+        show: &mut impl FnMut(&OnlineProgress<'_>),
+    ) -> Result<(), TrainingError> {
+        let sizes = &self.settings.replay;
+        let due = self.settings.finetune.updates_due(self.state.policy_steps, sizes.batch * sizes.length);
+        while self.state.updates < due && !stop.load(Ordering::Relaxed) {
+            let phase = self.update(learning)?;
+            self.state.updates += 1;
+            let updates = self.state.updates;
+            let mut line = updates
+                .is_multiple_of(self.settings.metrics_every)
+                .then(|| learning.interval.end(updates, phase));
+            if let Some(line) = &mut line {
+                line.set("policy_steps", self.state.policy_steps as f64);
+                line.set("environment_steps", (ACTION_REPEAT * self.state.policy_steps) as f64);
+                line.set("refused_actions", self.refused_actions as f64);
+                self.success_rate().into_iter().for_each(|rate| line.set("success_rate", rate));
+                self.run.log(line)?;
+            }
+            if updates.is_multiple_of(self.settings.checkpoint_every) {
+                self.save()?;
+            }
+            show(&OnlineProgress { line: line.as_ref(), ..self.progress() });
+        }
+        Ok(())
+    }
+
+    fn update(&mut self, learning: &mut Learning) -> Result<&'static str, TrainingError> {
+        let Learning { batches, interval } = learning;
+        let number = self.state.updates;
+        let batch = interval.time(Spent::WaitingForBatches, || batches.next_batch())?;
+        let batch = batch.into_tensors(&self.device)?;
+        let mut sampler = Sampler::numbered(self.settings.seed, number);
+        let warm_up = number < self.settings.finetune.warm_up_updates;
+        let (world, behaviour) = interval.time(Spent::Learning, || {
+            let world = self.world.update(&batch, &mut sampler)?;
+            if warm_up {
+                return Ok((world, None));
+            }
+            let start = world.posteriors.map(|x| x.flatten(0, 1))?; // [B*T, ...]
+            let behaviour = self.behaviour.update(&start, &mut sampler)?;
+            Ok::<_, TrainingError>((world, Some(behaviour)))
+        })?;
+        let mut values = json!({"losses": world.losses, "gradient_norm": world.gradient_norm});
+        if let Some(behaviour) = behaviour {
+            values["behaviour"] = json!(behaviour);
+        }
+        interval.update(&values);
+        Ok(if warm_up { "warm_up" } else { ONLINE })
+    }
+
+    fn prefetch(&self, replay: &SharedReplay) -> Result<Prefetch, TrainingError> {
+        let (sizes, replay) = (self.settings.replay.clone(), replay.clone());
+        let (seed, masks) = (self.settings.seed ^ REPLAY_STREAM, self.settings.finetune.masks);
+        Ok(Prefetch::start(self.state.updates, sizes.prefetch, move |number| {
+            replay.draw(sizes.batch, sizes.length, masks, seed, number)
+        })?)
+    }
+
+    /// What simulators are to run: new layouts, also after a run was resumed.
+    fn launches(&self) -> Vec<Launch> {
+        let finetune = &self.settings.finetune;
+        let launch = |index: usize| {
+            let instance = format!("{}-{}-{index}", self.settings.phase.verb(), std::process::id());
+            let first = FIRST_EPISODE + index as u64 * EPISODES_A_SIMULATOR + self.state.episodes;
+            Launch {
+                first_episode: first,
+                steps_max: finetune.episode_steps,
+                masks: finetune.masks,
+                disturb: finetune.disturb.clone(),
+                ..Launch::remote(&self.settings.task, &instance, self.settings.seed)
+            }
+        };
+        (0..finetune.simulators).map(launch).collect()
+    }
+
+    /// Saves a checkpoint; it is the best if the newest episodes had the highest success rate of all checkpoints, the first of equals.
+    fn save(&mut self) -> Result<(), TrainingError> {
+        self.state.return_range = self.behaviour.return_range();
+        let full = self.newest.len() == self.settings.finetune.success_episodes;
+        let success = self.success_rate().filter(|_| full);
+        let is_best = success.is_some_and(|rate| self.state.best_success.is_none_or(|best| rate > best));
+        if is_best {
+            self.state.best_success = success;
+        }
+        let [actor, critic] = self.behaviour.adams();
+        let [world_name, actor_name, critic_name] = OPTIMISERS;
+        let optimisers = [(world_name, self.world.adam()), (actor_name, actor), (critic_name, critic)];
+        self.run.save(&self.parameters, &self.settings, &self.state, &optimisers, is_best.into())
+    }
+
+    fn success_rate(&self) -> Option<f64> {
+        let count = self.newest.iter().filter(|success| **success).count();
+        (!self.newest.is_empty()).then(|| count as f64 / self.newest.len() as f64)
+    }
+
+    fn progress(&self) -> OnlineProgress<'static> {
+        OnlineProgress {
+            updates: self.state.updates,
+            policy_steps: self.state.policy_steps,
+            line: None,
+            episode: None,
+            success_rate: self.success_rate(),
+        }
+    }
+}
+
+/// Name of the stage in which the policy acts.
+const ONLINE: &str = "online";
+
+/// What updates take from.
+struct Learning {
+    batches: Prefetch,
+    interval: Interval,
+}
+
+fn sight(gathered: &Gathered) -> Sight<'_> {
+    let observation = &gathered.observation;
+    Sight {
+        simulator: gathered.simulator,
+        first: gathered.is_first(),
+        image: &observation.image,
+        executed: observation.executed_action,
+    }
+}
+
+/// Refuses a model with a number that is not finite.
+fn check_finite(parameters: &Parameters) -> Result<(), TrainingError> {
+    for (name, var) in parameters.iter() {
+        let values = var.flatten_all()?.to_vec1::<f32>()?;
+        let count = values.iter().filter(|value| !value.is_finite()).count();
+        if count > 0 {
+            return Err(ParameterError::NotFinite { name: name.to_owned(), count }.into());
+        }
+    }
+    Ok(())
+}
