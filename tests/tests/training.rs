@@ -1,4 +1,5 @@
 //! The trainer as a program: it collects from real simulators, and whoever kills it finds a run that loads.
+#![allow(clippy::unwrap_used, reason = "a test may panic")]
 
 use std::path::Path;
 use std::time::{Duration, Instant};

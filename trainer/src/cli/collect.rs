@@ -11,12 +11,13 @@ use serde::Serialize;
 /// Record episodes of Meta-World, as Dreamer's .npz files in one folder a task
 #[derive(Debug, clap::Args)]
 #[command(after_help = "Examples:
-  rcwm-trainer collect --task upstream --expert 50 --mixed 28 --random 8 --masks 4 --out data/upstream
+  rcwm-trainer collect --task upstream --expert 50 --mixed 28 --random 8 --masks 4 --out data
   rcwm-trainer collect --task hammer --expert 50 --out data/hammer
   rcwm-trainer collect --join arm1 --episodes 10 --out data/arm1
 
-The simulators are started and stopped here; --join records one that runs already. Episodes that --out holds already are not
-recorded again: after Ctrl-C the same command goes on. Another --seed gives other layouts and is added to what is there.")]
+The simulators are started and stopped here; --join records one that runs already. Episodes that
+--out holds already are not recorded again: after Ctrl-C the same command goes on. Another --seed
+gives other layouts and is added to what is there.")]
 pub struct Collect {
     /// A task's name, `upstream` (the paper's four) or `downstream` (its eight); repeatable
     #[arg(long = "task", value_name = "TASK", required_unless_present = "join")]

@@ -22,14 +22,17 @@ use serde::Serialize;
 /// Judge models: robot dynamics on recorded episodes, or success in the simulator
 #[derive(Debug, clap::Args)]
 #[command(after_help = "Examples:
-  rcwm-trainer evaluate --checkpoint runs/small/checkpoints/best --checkpoint runs/vanilla/checkpoints/best --data data/unseen \\
-      --out runs/dynamics --json runs/dynamics/report.json
+  rcwm-trainer evaluate --checkpoint runs/small/checkpoints/best --checkpoint \\
+      runs/vanilla/checkpoints/best --data data/unseen --out runs/dynamics --json \\
+      runs/dynamics/report.json
   rcwm-trainer evaluate --checkpoint runs/hammer/checkpoints/best --task hammer --episodes 20
-  rcwm-trainer evaluate --bundle bundles/hammer --task hammer --episodes 20 --disturb textures --simulators 2
+  rcwm-trainer evaluate --bundle bundles/hammer --task hammer --episodes 20 --disturb textures \\
+      --simulators 2
 
-With --data (paper, Fig. 4 and 7): every model sees some steps of the same trajectories and imagines the rest with the recorded
-actions. The robot dynamics error is the squared error between imagined and true picture, both multiplied by the true robot mask, mean
-over the whole picture; the episodes need masks. With --task: the policy is exported and deployed by rcwm-runtime in
+With --data (paper, Fig. 4 and 7): every model sees some steps of the same trajectories and
+imagines the rest with the recorded actions. The robot dynamics error is the squared error between
+imagined and true picture, both multiplied by the true robot mask, mean over the whole picture;
+the episodes need masks. With --task: the policy is exported and deployed by rcwm-runtime in
 rcwm-simulator, in lock-step.")]
 #[command(group = clap::ArgGroup::new("on").required(true).args(["data", "tasks"]))]
 pub struct Evaluate {

@@ -16,13 +16,16 @@ use super::bars::{self, absolute};
 /// Learn a task from demonstrations alone: environment's side, whole world model, then the actor
 #[derive(Debug, clap::Args)]
 #[command(after_help = "Examples:
-  rcwm-trainer fewshot --from runs/small/checkpoints/last --data data/upstream --task button-press --out runs/button-press
-  rcwm-trainer fewshot --from runs/small/checkpoints/last --data data/hammer --out runs/hammer --reset all-but-robot \\
-      --set fewshot.environment_updates=600 --set fewshot.demonstrations=20
+  rcwm-trainer fewshot --from runs/small/checkpoints/last --data data/upstream --task \\
+      button-press --out runs/button-press
+  rcwm-trainer fewshot --from runs/small/checkpoints/last --data data/hammer --out runs/hammer \\
+      --reset all-but-robot --set fewshot.environment_updates=600 --set \\
+      fewshot.demonstrations=20
   rcwm-trainer fewshot --out runs/button-press --resume
 
-Only successful episodes are used. Every setting and its value is in settings.toml of the run's folder. A resumed run gives the same
-weights, bit for bit, as one that was never interrupted, with the same RAYON_NUM_THREADS.")]
+Only successful episodes are used. Every setting and its value is in settings.toml of the run's
+folder. A resumed run gives the same weights, bit for bit, as one that was never interrupted, with
+the same RAYON_NUM_THREADS.")]
 pub struct Fewshot {
     /// Checkpoint of the pre-trained model
     #[arg(long, value_name = "CHECKPOINT", required_unless_present = "resume")]

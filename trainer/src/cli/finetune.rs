@@ -14,16 +14,20 @@ const ROBOT_RATE: f64 = 5e-5;
 /// Learn a task by acting and learning, from a pre-trained model
 #[derive(Debug, clap::Args)]
 #[command(after_help = "Examples:
-  rcwm-trainer finetune --from runs/small/checkpoints/last --task hammer --out runs/hammer --simulators 2
-  rcwm-trainer finetune --from runs/small/checkpoints/last --task hammer --out runs/hammer --data data/hammer \\
-      --reset heads --separate-rates --set finetune.train_ratio=128
-  rcwm-trainer finetune --from runs/few-shot/checkpoints/last --task hammer --out runs/hammer --reset none --keep-behaviour
-  rcwm-trainer finetune --from runs/small/checkpoints/last --task reach --out runs/reach --join arm1 --join arm2
+  rcwm-trainer finetune --from runs/small/checkpoints/last --task hammer --out runs/hammer \\
+      --simulators 2
+  rcwm-trainer finetune --from runs/small/checkpoints/last --task hammer --out runs/hammer \\
+      --data data/hammer --reset heads --separate-rates --set finetune.train_ratio=128
+  rcwm-trainer finetune --from runs/few-shot/checkpoints/last --task hammer --out runs/hammer \\
+      --reset none --keep-behaviour
+  rcwm-trainer finetune --from runs/small/checkpoints/last --task reach --out runs/reach \\
+      --join arm1 --join arm2
   rcwm-trainer finetune --out runs/hammer --resume
 
-The replay begins with successful episodes of the scripted expert and random steps, recorded on the spot into OUT/episodes or taken
-from --data. A step is one decision of the policy, two steps of the environment. Ctrl-C saves; --resume brings back weights, optimisers,
-counters and the replay, and the simulators begin new episodes.")]
+The replay begins with successful episodes of the scripted expert and random steps, recorded on
+the spot into OUT/episodes or taken from --data. A step is one decision of the policy, two steps
+of the environment. Ctrl-C saves; --resume brings back weights, optimisers, counters and the
+replay, and the simulators begin new episodes.")]
 pub struct Finetune {
     /// Checkpoint of the model to start from
     #[arg(long, value_name = "CHECKPOINT", required_unless_present = "resume")]

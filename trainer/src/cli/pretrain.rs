@@ -13,12 +13,15 @@ use rcwm_trainer::training::{
 #[derive(Debug, clap::Args)]
 #[command(after_help = "Examples:
   rcwm-trainer pretrain --preset small --data data/upstream --out runs/small
-  rcwm-trainer pretrain --preset small --model vanilla --data data/upstream --out runs/vanilla --set replay.batch=4
+  rcwm-trainer pretrain --preset small --model vanilla --data data/upstream --out runs/vanilla \\
+      --set replay.batch=4
   rcwm-trainer pretrain --out runs/small --resume --set pretrain.updates=40000
 
-Every setting and its value is in settings.toml of the run's folder; curves.png there and TensorBoard (tensorboard --logdir runs)
-show how it goes. replay.held_out_episodes of each task are not trained on: the best checkpoint is chosen by them. RAYON_NUM_THREADS sets the number of threads; with the same
-number a resumed run gives the same weights, bit for bit, as one that was never interrupted.")]
+Every setting and its value is in settings.toml of the run's folder; curves.png there and
+TensorBoard (tensorboard --logdir runs) show how it goes. replay.held_out_episodes of each task
+are not trained on: the best checkpoint is chosen by them. RAYON_NUM_THREADS sets the number of
+threads; with the same number a resumed run gives the same weights, bit for bit, as one that was
+never interrupted.")]
 pub struct Pretrain {
     /// Sizes to start from
     #[arg(long, value_enum, default_value = "small", conflicts_with = "resume")]

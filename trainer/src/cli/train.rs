@@ -10,11 +10,13 @@ use super::online::Online;
 #[derive(Debug, clap::Args)]
 #[command(after_help = "Examples:
   rcwm-trainer train --task button-press --preset small --out runs/scratch --simulators 2 --masks
-  rcwm-trainer train --task hammer --preset paper --model vanilla --out runs/baseline --set finetune.steps=250000
+  rcwm-trainer train --task hammer --preset paper --model vanilla --out runs/baseline --set \\
+      finetune.steps=250000
   rcwm-trainer train --out runs/scratch --resume
 
-The replay begins with successful episodes of the scripted expert and random steps, as that of finetune does; set
-finetune.expert_episodes=0 to start without an expert. A step is one decision of the policy, two steps of the environment.")]
+The replay begins with successful episodes of the scripted expert and random steps, as that of
+finetune does; set finetune.expert_episodes=0 to start without an expert. A step is one decision
+of the policy, two steps of the environment.")]
 pub struct Train {
     /// Sizes to start from
     #[arg(long, value_enum, default_value = "small", conflicts_with = "resume")]
