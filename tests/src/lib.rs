@@ -169,6 +169,12 @@ impl Running {
         self.child.try_wait().expect("its state is known").is_none()
     }
 
+    /// The number of its process.
+    #[must_use]
+    pub fn id(&self) -> u32 {
+        self.child.id()
+    }
+
     /// Sends a signal.
     ///
     /// # Panics

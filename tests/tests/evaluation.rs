@@ -22,6 +22,11 @@ fn evaluate(domain: &Domain, checkpoint: &Path, rest: &[&str]) -> Command {
     command
 }
 
+/// Files left in the shared memory that this evaluation had for itself.
+fn leftovers(trainer: &Running) -> Vec<String> {
+    rcwm_models::wire::list_leftovers(&format!("rcwm_e{}_", trainer.id())).unwrap()
+}
+
 /// Processes other than this one whose command line names the folder.
 fn processes_with(folder: &Path) -> usize {
     let name = folder.to_string_lossy().into_owned();
@@ -39,7 +44,9 @@ fn a_policy_is_judged_by_whole_episodes_and_nothing_is_left_behind() {
         let rest = ["--episodes", "3", "--steps-max", "8", "--seed", "5", "--simulators", simulators];
         let mut command = evaluate(&domain, &checkpoint, &rest);
         command.arg("--json").arg(file);
-        Running::start(command).succeed();
+        let mut trainer = Running::start(command);
+        trainer.succeed();
+        assert_eq!(leftovers(&trainer), Vec::<String>::new());
         read_json(file)["tasks"][0].clone()
     };
     let (one, two) = (measured(&json("one.json"), "1"), measured(&json("two.json"), "2"));
@@ -53,7 +60,6 @@ fn a_policy_is_judged_by_whole_episodes_and_nothing_is_left_behind() {
     }
     assert_eq!(one["returns"], two["returns"], "layouts do not depend on how many simulators there are");
     assert_eq!(two["runtimes"].as_array().unwrap().len(), 2);
-    assert_eq!(rcwm_models::wire::list_leftovers("rcwm_e").unwrap(), Vec::<String>::new());
 }
 
 #[test]
@@ -70,6 +76,7 @@ fn ctrl_c_ends_simulators_and_runtimes_too() {
     assert!(!trainer.end().success());
     assert!(trainer.printed().contains("interrupted"), "{}", trainer.printed());
     assert_eq!(processes_with(&scratch), 0);
+    assert_eq!(leftovers(&trainer), Vec::<String>::new());
     assert_eq!(std::fs::read_dir(&scratch).unwrap().count(), 0, "the temporary bundle is gone");
 }
 

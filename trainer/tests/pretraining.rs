@@ -51,6 +51,7 @@ fn settings(kind: ModelKind, updates: u64) -> TrainingSettings {
     settings.pretrain.updates = updates;
     settings.metrics_every = 2;
     settings.checkpoint_every = 5;
+    settings.film.length = 0;
     settings
 }
 
@@ -137,8 +138,9 @@ fn a_run_that_died_after_a_checkpoint_repeats_what_was_lost() {
 #[test]
 fn a_stopped_run_is_saved_where_it_was() {
     let folder = tempfile::tempdir().unwrap();
-    let mut training =
-        Pretraining::create(folder.path(), settings(ModelKind::Rcwm, 100), &Device::Cpu).unwrap();
+    let mut settings = settings(ModelKind::Rcwm, 100);
+    settings.film.length = 16;
+    let mut training = Pretraining::create(folder.path(), settings, &Device::Cpu).unwrap();
     let stop = AtomicBool::new(false);
     let halt = |updates| stop.store(updates >= 7, Ordering::Relaxed);
     let outcome = training.run(replay(), &stop, |progress| halt(progress.updates)).unwrap();

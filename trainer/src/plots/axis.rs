@@ -63,7 +63,7 @@ pub(super) fn tick_label(value: f64) -> String {
     if size < 1e-12 {
         return "0".to_owned();
     }
-    if size >= 1e5 || size < 1e-3 {
+    if !(1e-3..1e5).contains(&size) {
         let text = format!("{value:.1e}");
         return text.replace(".0e", "e");
     }

@@ -7,7 +7,7 @@ use crate::model::latent::Sampler;
 use crate::replay::Replay;
 
 /// What sets these batches apart from those that are trained on under the same seed.
-const STREAM: u64 = 0x6865_6c64_6f75_74;
+const STREAM: u64 = 0x0068_656c_646f_7574;
 
 /// Episodes that are not trained on, and the batches that are drawn of them.
 #[derive(Debug)]
