@@ -168,6 +168,7 @@ fn few_shot_learning_that_was_interrupted_in_any_stage_gives_the_same_weights() 
         let source = pretrained(kind);
         let mut learning = Fewshot::create(&whole, settings.clone(), &source, &Device::Cpu).unwrap();
         assert_eq!(learn(&mut learning, u64::MAX), Outcome { updates: 20, interrupted: false });
+        assert!(whole.join("films/000020-hammer.png").exists() && whole.join("curves.png").exists());
         let expected = bits(learning.parameters());
 
         let mut learning = Fewshot::create(&parts, settings.clone(), &source, &Device::Cpu).unwrap();

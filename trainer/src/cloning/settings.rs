@@ -65,7 +65,7 @@ impl Default for CloningSettings {
             weight: Ramp { first: 2.0, last: 0.8, updates: 20_000 },
             imagination_weight: Ramp { first: 0.01, last: 0.2, updates: 20_000 },
             actor: AdamSettings {
-                learning_rate: 3e-4,
+                learning_rate: 1e-3,
                 eps: 1e-5,
                 clip_norm: 100.0,
                 ..AdamSettings::default()

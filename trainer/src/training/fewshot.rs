@@ -7,6 +7,7 @@ use rcwm_models::episode::Episode;
 use rcwm_models::settings::ModelKind;
 use serde_json::json;
 
+use super::film::{Scene, write_films};
 use super::{
     Best, FewshotSettings, Interval, Line, Outcome, Phase, Run, Spent, TrainingError, TrainingSettings,
     TrainingState, start_from,
@@ -80,6 +81,7 @@ pub struct Fewshot {
     world: WorldLearner,
     cloning: CloningLearner,
     state: TrainingState,
+    scenes: Vec<Scene>,
 }
 
 impl Fewshot {
@@ -122,7 +124,16 @@ impl Fewshot {
         let world = WorldLearner::new(&parameters, model, &settings.world, Trained::World)?;
         let cloning =
             CloningLearner::new(&parameters, model, &settings.fewshot.cloning, &settings.behaviour)?;
-        Ok(Self { settings, device: device.clone(), run, parameters, world, cloning, state })
+        Ok(Self {
+            settings,
+            device: device.clone(),
+            run,
+            parameters,
+            world,
+            cloning,
+            state,
+            scenes: Vec::new(),
+        })
     }
 
     /// Goes on with the run in `folder` from its newest checkpoint, or from the beginning if there is none yet.
@@ -177,6 +188,7 @@ impl Fewshot {
         mut show: impl FnMut(u64, Option<&Line>),
     ) -> Result<Outcome, TrainingError> {
         let total = self.settings.fewshot.updates();
+        self.scenes = self.settings.film.scenes(&replay);
         let episodes: Vec<_> = replay.tasks().flat_map(|(_, episodes)| episodes).cloned().collect();
         let mut work = Work { batches: None, replay, examples: None, stage: None };
         let mut interval = Interval::begin();
@@ -304,7 +316,11 @@ impl Fewshot {
         let [actor, critic] = self.cloning.adams();
         let [world_name, actor_name, critic_name] = OPTIMISERS;
         let optimisers = [(world_name, self.world.adam()), (actor_name, actor), (critic_name, critic)];
-        self.run.save(&self.parameters, &self.settings, &self.state, &optimisers, Best::No)
+        self.run.save(&self.parameters, &self.settings, &self.state, &optimisers, Best::No)?;
+        self.run.draw_curves(0)?;
+        let agent = Agent::new(&self.parameters.frozen(), &self.settings.model)?;
+        let (film, update) = (&self.settings.film, self.state.updates);
+        write_films(&self.run, &agent, &self.scenes, film, update, &self.device)
     }
 }
 

@@ -6,6 +6,7 @@ use candle_core::Device;
 use serde::Serialize;
 use serde_json::json;
 
+use super::film::{Scene, write_films};
 use super::prefill::{Prefilled, policy_episode, prefill};
 use super::{Interval, Line, Phase, Run, Spent, TrainingError, TrainingSettings, TrainingState, start_from};
 use crate::acting::{Fleet, Gathered, Policy, Recorded, Seen as Sight};
@@ -110,6 +111,7 @@ pub struct Finetuning {
     state: TrainingState,
     newest: VecDeque<bool>,
     refused_actions: u64,
+    scenes: Vec<Scene>,
 }
 
 impl Finetuning {
@@ -166,6 +168,7 @@ impl Finetuning {
             state,
             newest: VecDeque::new(),
             refused_actions: 0,
+            scenes: Vec::new(),
         })
     }
 
@@ -239,6 +242,7 @@ impl Finetuning {
     ) -> Result<OnlineOutcome, TrainingError> {
         let most = self.settings.finetune.success_episodes;
         self.newest = filled.policy_successes.iter().rev().take(most).rev().copied().collect();
+        self.scenes = self.settings.film.scenes(&filled.replay);
         let replay = SharedReplay::new(filled.replay);
         let mut learning = Learning { batches: self.prefetch(&replay)?, interval: Interval::begin() };
         let done = self.work(&replay, &mut learning, join, stop, &mut show);
@@ -444,7 +448,11 @@ impl Finetuning {
         let [actor, critic] = self.behaviour.adams();
         let [world_name, actor_name, critic_name] = OPTIMISERS;
         let optimisers = [(world_name, self.world.adam()), (actor_name, actor), (critic_name, critic)];
-        self.run.save(&self.parameters, &self.settings, &self.state, &optimisers, is_best.into())
+        self.run.save(&self.parameters, &self.settings, &self.state, &optimisers, is_best.into())?;
+        self.run.draw_curves(self.settings.finetune.warm_up_updates)?;
+        let agent = Agent::new(&self.parameters.frozen(), &self.settings.model)?;
+        let (film, update) = (&self.settings.film, self.state.updates);
+        write_films(&self.run, &agent, &self.scenes, film, update, &self.device)
     }
 
     fn success_rate(&self) -> Option<f64> {

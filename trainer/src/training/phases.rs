@@ -86,10 +86,10 @@ impl FewshotSettings {
             Preset::Small => Self {
                 environment_updates: 300,
                 world_updates: 300,
-                actor_updates: 4000,
+                actor_updates: 16_000,
                 cloning: CloningSettings {
                     imagination_rows: 64,
-                    weight: Ramp { updates: 4000, ..paper.cloning.weight },
+                    weight: Ramp { updates: 16_000, ..paper.cloning.weight },
                     imagination_weight: off,
                     ..paper.cloning
                 },

@@ -1,13 +1,12 @@
 use std::path::Path;
-use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, Ordering};
 use std::time::Instant;
 
 use candle_core::Device;
-use rcwm_models::episode::Episode;
 
+use super::film::{Scene, write_films};
 use super::held_out::{HeldOut, mean_losses};
-use super::{Best, HeldOutLosses, Metrics, Run, TrainingError, TrainingSettings, TrainingState, film};
+use super::{Best, HeldOutLosses, Metrics, Run, TrainingError, TrainingSettings, TrainingState};
 use crate::learning::{LossValues, Trained, WorldLearner, WorldUpdate};
 use crate::model::agent::{self, Agent};
 use crate::model::latent::Sampler;
@@ -186,13 +185,7 @@ impl Pretraining {
         let optimisers = [(WORLD, self.learner.adam())];
         self.run.save(&self.parameters, &self.settings, &self.state, &optimisers, best)?;
         self.run.draw_curves(self.settings.pretrain.warm_up_updates)?;
-        for (task, episode) in &judge.scenes {
-            let settings = &self.settings.film;
-            let film = film(&agent, episode, settings, &self.device)?;
-            let films = self.run.films()?;
-            film.write_strip(settings.every, &films.join(format!("{update:06}-{task}.png")))?;
-            film.write_gif(&films.join(format!("{task}.gif")))?;
-        }
+        write_films(&self.run, &agent, &judge.scenes, &self.settings.film, update, &self.device)?;
         Ok(line)
     }
 }
@@ -201,7 +194,7 @@ impl Pretraining {
 #[derive(Debug)]
 struct Judge {
     held_out: HeldOut,
-    scenes: Vec<(String, Arc<Episode>)>,
+    scenes: Vec<Scene>,
 }
 
 impl Judge {
