@@ -27,7 +27,7 @@ lint: ## Formatting, clippy with warnings denied, licences (where cargo-deny is 
 	@scripts/setup demo
 	$(CARGO) fmt --all --check
 	$(CARGO) clippy --release --locked --workspace --all-targets -- -D warnings
-	@if $(CARGO) deny --version >/dev/null 2>&1; then $(CARGO) deny --offline check bans licenses sources; \
+	@if $(CARGO) deny --version >/dev/null 2>&1; then $(CARGO) deny check bans licenses sources; \
 	else echo "lint: cargo-deny is not installed, licences were not checked (cargo install cargo-deny)"; fi
 
 clean: ## Remove what was built and installed here
