@@ -3,12 +3,12 @@ use std::path::{Path, PathBuf};
 use std::sync::atomic::{AtomicBool, Ordering};
 
 use candle_core::Device;
-use serde::Serialize;
 use serde_json::json;
 
 use super::film::{Scene, write_films};
 use super::prefill::{Prefilled, policy_episode, prefill};
-use super::{Interval, Line, Phase, Run, Spent, TrainingError, TrainingSettings, TrainingState, start_from};
+use super::{EpisodeFacts, EpisodeLine, OnlineOutcome, OnlineProgress};
+use super::{Interval, Phase, Run, Spent, TrainingError, TrainingSettings, TrainingState, start_from};
 use crate::acting::{Fleet, Gathered, Policy, Recorded, Seen as Sight};
 use crate::behaviour::BehaviourLearner;
 use crate::checkpoint::Checkpoint;
@@ -29,69 +29,6 @@ const FIRST_EPISODE: u64 = 3_000_000;
 const EPISODES_A_SIMULATOR: u64 = 1_000_000;
 /// Steps of the environment in one decision of the policy.
 const ACTION_REPEAT: u64 = 2;
-
-/// One episode of the policy, as a line of metrics tells it.
-#[derive(Debug, Clone, PartialEq, Serialize)]
-pub struct EpisodeLine {
-    /// Updates made when it ended.
-    pub update: u64,
-    /// `online`.
-    pub phase: &'static str,
-    /// The episode.
-    pub episode: EpisodeFacts,
-}
-
-/// How an episode of the policy went.
-#[derive(Debug, Clone, PartialEq, Serialize)]
-pub struct EpisodeFacts {
-    /// Episodes that the policy has finished, this one included.
-    pub number: u64,
-    /// Which simulator.
-    pub simulator: usize,
-    /// Whether the task was solved at any step.
-    pub success: bool,
-    /// Sum of the rewards.
-    #[serde(rename = "return")]
-    pub total_reward: f64,
-    /// Decisions in it.
-    pub steps: u64,
-    /// Decisions that the policy has made in all.
-    pub policy_steps: u64,
-    /// Steps of the environment that these were.
-    pub environment_steps: u64,
-}
-
-/// Where a run stands, for whoever shows it.
-#[derive(Debug, Clone)]
-pub struct OnlineProgress<'a> {
-    /// Updates made.
-    pub updates: u64,
-    /// Decisions that the policy has made.
-    pub policy_steps: u64,
-    /// The newest line of metrics, when there is a new one.
-    pub line: Option<&'a Line>,
-    /// The episode that has just ended.
-    pub episode: Option<&'a EpisodeLine>,
-    /// Share of successes in the newest episodes; none before the first.
-    pub success_rate: Option<f64>,
-}
-
-/// How a run ended.
-#[derive(Debug, Clone, Copy, PartialEq)]
-pub struct OnlineOutcome {
-    /// Updates made in all.
-    pub updates: u64,
-    /// Decisions made in all.
-    pub policy_steps: u64,
-    /// Episodes finished in all.
-    pub episodes: u64,
-    /// Share of successes in the newest episodes.
-    pub success_rate: Option<f64>,
-    /// Actions that were not finite, and zeros in their place.
-    pub refused_actions: u64,
-    /// Whether it was stopped before its end; it can be resumed.
-    pub interrupted: bool,
-}
 
 /// Acting and learning on one task: see [`super::FinetuneSettings`]. Fine-tuning and training from scratch differ in what they start
 /// from only.

@@ -32,7 +32,7 @@
 //! | `reset` | what such a phase starts from |
 //! | `demonstrations`, `fewshot` | a task from recorded successes alone |
 //! | `prefill`, `finetune` | acting and learning, after pre-training or from scratch |
-//! | `averages` | their lines of metrics |
+//! | `averages`, `online` | their lines of metrics and their progress |
 
 mod averages;
 mod curves;
@@ -42,6 +42,7 @@ mod film;
 mod finetune;
 mod held_out;
 mod metrics;
+mod online;
 mod phases;
 mod prefill;
 mod pretrain;
@@ -55,8 +56,9 @@ pub use averages::{Averages, Interval, Line, Spent};
 pub use demonstrations::demonstrations;
 pub use fewshot::{Fewshot, Stage};
 pub use film::{FilmSettings, film};
-pub use finetune::{EpisodeFacts, EpisodeLine, Finetuning, OnlineOutcome, OnlineProgress};
+pub use finetune::Finetuning;
 pub use metrics::{HeldOutLosses, Metrics};
+pub use online::{EpisodeFacts, EpisodeLine, OnlineOutcome, OnlineProgress};
 pub use phases::{FewshotSettings, FinetuneSettings, Phase};
 pub use prefill::{Prefilled, episodes_folder, prefill};
 pub use pretrain::{Outcome, Pretraining, Progress};
