@@ -23,7 +23,7 @@ use rcwm_trainer::model::latent::Sampler;
 use rcwm_trainer::model::parameters::Parameters;
 use rcwm_trainer::replay::Replay;
 use rcwm_trainer::training::{
-    Fewshot, Outcome, Phase, Reset, ResetSettings, Run, Stage, TrainingError, TrainingSettings,
+    Fewshot, Outcome, Phase, Pretraining, Reset, ResetSettings, Run, Stage, TrainingError, TrainingSettings,
     demonstrations, start_from,
 };
 
@@ -82,6 +82,16 @@ fn pretrained(kind: ModelKind) -> Checkpoint {
         var.set(&(var.as_tensor() + noise).unwrap().detach()).unwrap();
     }
     checkpoint
+}
+
+#[test]
+fn a_run_is_resumed_by_the_verb_that_made_it_only() {
+    let folder = tempfile::tempdir().unwrap();
+    let mut settings = TrainingSettings::preset(Preset::Debug, ModelKind::Rcwm, "memory".into());
+    Pretraining::create(folder.path(), settings.clone(), &Device::Cpu).unwrap();
+    settings.phase = Phase::Fewshot;
+    let error = Pretraining::resume(folder.path(), settings, &Device::Cpu).unwrap_err().to_string();
+    assert!(error.contains("rcwm-trainer fewshot --resume"), "{error}");
 }
 
 #[test]

@@ -1,13 +1,15 @@
-use std::path::{Path, PathBuf};
+use std::path::PathBuf;
 use std::process::ExitCode;
 
-use anyhow::{Context, Result};
+use anyhow::Result;
 use indicatif::{ProgressBar, ProgressStyle};
 use rcwm_models::settings;
 use rcwm_trainer::replay::{Folder, Replay};
 use rcwm_trainer::training::{
     HeldOutLosses, Metrics, Pretraining, Progress, Run, TrainingError, TrainingSettings,
 };
+
+use super::bars::{self, absolute};
 
 /// Train a world model on recorded episodes: mask warm-up, then mask-free
 #[derive(Debug, clap::Args)]
@@ -64,7 +66,7 @@ impl Pretrain {
         } else {
             Pretraining::create(&self.out, settings.clone(), &device)?
         };
-        let bar = progress_bar(&settings, training.updates());
+        let bar = bars::updates(settings.pretrain.updates, training.updates());
         let outcome = training.run(replay, &stop, |progress| show(&bar, progress))?;
         bar.finish_and_clear();
         let out = self.out.display();
@@ -98,11 +100,6 @@ impl Pretrain {
     }
 }
 
-/// A run may be resumed from another folder.
-fn absolute(path: &Path) -> Result<PathBuf> {
-    std::path::absolute(path).with_context(|| format!("{}", path.display()))
-}
-
 fn load(settings: &TrainingSettings) -> Result<Replay> {
     let masks = Some(settings.masks.as_path()).filter(|path| !path.as_os_str().is_empty());
     let folder = Folder::list(&settings.data, masks)?;
@@ -120,16 +117,6 @@ fn load(settings: &TrainingSettings) -> Result<Replay> {
         masked.steps()
     );
     Ok(replay)
-}
-
-fn progress_bar(settings: &TrainingSettings, done: u64) -> ProgressBar {
-    let bar = ProgressBar::new(settings.pretrain.updates);
-    if let Ok(style) = ProgressStyle::with_template("{wide_bar} {pos}/{len} ETA {eta}\n{msg}") {
-        bar.set_style(style);
-    }
-    bar.set_position(done);
-    bar.reset_eta();
-    bar
 }
 
 fn show(bar: &ProgressBar, progress: &Progress<'_>) {

@@ -8,6 +8,7 @@ use rcwm_models::settings::ModelKind;
 use serde_json::json;
 
 use super::film::{Scene, write_films};
+use super::run::GoesOn;
 use super::{
     Best, FewshotSettings, Interval, Line, Outcome, Phase, Run, Spent, TrainingError, TrainingSettings,
     TrainingState, start_from,
@@ -141,21 +142,15 @@ impl Fewshot {
     /// # Errors
     /// See [`TrainingError`].
     pub fn resume(folder: &Path, settings: TrainingSettings, device: &Device) -> Result<Self, TrainingError> {
-        settings.validate()?;
-        if settings.phase != Phase::Fewshot {
-            let found = settings.phase.verb();
-            return Err(TrainingError::OtherPhase { path: folder.to_path_buf(), found });
-        }
-        if !Run::has_checkpoint(folder) {
-            let source = Checkpoint::read(&settings.from, device)?;
-            return Self::fresh(Run::resume(folder, &settings, 0)?, settings, &source, device);
-        }
-        let (checkpoint, state, moments) = Run::load(folder, device)?;
-        if checkpoint.settings.model != settings.model {
-            return Err(TrainingError::OtherModel);
-        }
-        let run = Run::resume(folder, &settings, state.updates)?;
-        let mut this = Self::of(run, settings, checkpoint.parameters, state, device)?;
+        let (run, parameters, state, moments) =
+            match Run::go_on(folder, &settings, &[Phase::Fewshot], device)? {
+                GoesOn::FromStart(run) => {
+                    let source = Checkpoint::read(&settings.from, device)?;
+                    return Self::fresh(run, settings, &source, device);
+                }
+                GoesOn::From { run, parameters, state, moments } => (run, parameters, state, moments),
+            };
+        let mut this = Self::of(run, settings, parameters, state, device)?;
         let adam = |name: &str, settings| this.state.optimiser(name, settings, &moments, &this.parameters);
         let [world, actor, critic] = OPTIMISERS;
         *this.world.adam_mut() = adam(world, &this.settings.world.adam)?;

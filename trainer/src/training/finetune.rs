@@ -7,6 +7,7 @@ use serde_json::json;
 
 use super::film::{Scene, write_films};
 use super::prefill::{Prefilled, policy_episode, prefill};
+use super::run::GoesOn;
 use super::{EpisodeFacts, EpisodeLine, OnlineOutcome, OnlineProgress};
 use super::{Interval, Phase, Run, Spent, TrainingError, TrainingSettings, TrainingState, start_from};
 use crate::acting::{Fleet, Gathered, Policy, Recorded, Seen as Sight};
@@ -114,25 +115,18 @@ impl Finetuning {
     /// # Errors
     /// See [`TrainingError`].
     pub fn resume(folder: &Path, settings: TrainingSettings, device: &Device) -> Result<Self, TrainingError> {
-        settings.validate()?;
-        if !matches!(settings.phase, Phase::Finetune | Phase::Train) {
-            let found = settings.phase.verb();
-            return Err(TrainingError::OtherPhase { path: folder.to_path_buf(), found });
-        }
-        if !Run::has_checkpoint(folder) {
-            let source = match settings.phase {
-                Phase::Finetune => Some(Checkpoint::read(&settings.from, device)?),
-                _ => None,
-            };
-            let run = Run::resume(folder, &settings, 0)?;
-            return Self::fresh(folder, run, settings, source.as_ref(), device);
-        }
-        let (checkpoint, state, moments) = Run::load(folder, device)?;
-        if checkpoint.settings.model != settings.model {
-            return Err(TrainingError::OtherModel);
-        }
-        let run = Run::resume(folder, &settings, state.updates)?;
-        let mut this = Self::of(folder, run, settings, checkpoint.parameters, state, device)?;
+        let phases = [Phase::Finetune, Phase::Train];
+        let (run, parameters, state, moments) = match Run::go_on(folder, &settings, &phases, device)? {
+            GoesOn::FromStart(run) => {
+                let source = match settings.phase {
+                    Phase::Finetune => Some(Checkpoint::read(&settings.from, device)?),
+                    _ => None,
+                };
+                return Self::fresh(folder, run, settings, source.as_ref(), device);
+            }
+            GoesOn::From { run, parameters, state, moments } => (run, parameters, state, moments),
+        };
+        let mut this = Self::of(folder, run, settings, parameters, state, device)?;
         let adam = |name: &str, settings| this.state.optimiser(name, settings, &moments, &this.parameters);
         let [world, actor, critic] = OPTIMISERS;
         *this.world.adam_mut() = adam(world, &this.settings.world.adam)?;

@@ -6,7 +6,8 @@ use candle_core::Device;
 
 use super::film::{Scene, write_films};
 use super::held_out::{HeldOut, mean_losses};
-use super::{Best, HeldOutLosses, Metrics, Run, TrainingError, TrainingSettings, TrainingState};
+use super::run::GoesOn;
+use super::{Best, HeldOutLosses, Metrics, Phase, Run, TrainingError, TrainingSettings, TrainingState};
 use crate::learning::{LossValues, Trained, WorldLearner, WorldUpdate};
 use crate::model::agent::{self, Agent};
 use crate::model::latent::Sampler;
@@ -80,18 +81,13 @@ impl Pretraining {
     /// # Errors
     /// See [`TrainingError`].
     pub fn resume(folder: &Path, settings: TrainingSettings, device: &Device) -> Result<Self, TrainingError> {
-        settings.validate()?;
-        if !Run::has_checkpoint(folder) {
-            return Self::fresh(Run::resume(folder, &settings, 0)?, settings, device);
-        }
-        let (checkpoint, state, moments) = Run::load(folder, device)?;
-        if checkpoint.settings.model != settings.model {
-            return Err(TrainingError::OtherModel);
-        }
-        let parameters = checkpoint.parameters;
+        let (run, parameters, state, moments) =
+            match Run::go_on(folder, &settings, &[Phase::Pretrain], device)? {
+                GoesOn::FromStart(run) => return Self::fresh(run, settings, device),
+                GoesOn::From { run, parameters, state, moments } => (run, parameters, state, moments),
+            };
         let mut learner = WorldLearner::new(&parameters, &settings.model, &settings.world, Trained::World)?;
         *learner.adam_mut() = state.optimiser(WORLD, &settings.world.adam, &moments, &parameters)?;
-        let run = Run::resume(folder, &settings, state.updates)?;
         Ok(Self { settings, device: device.clone(), run, parameters, learner, state })
     }
 

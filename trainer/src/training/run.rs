@@ -4,11 +4,12 @@ use std::path::{Path, PathBuf};
 
 use candle_core::Device;
 use rcwm_models::files::{read_capped, write_atomic};
+use rcwm_models::tensors::Tensors;
 use serde::{Deserialize, Serialize};
 
 use super::metrics::scalars;
 use super::tensorboard::EventFile;
-use super::{TrainingError, TrainingSettings, TrainingState, curves};
+use super::{Phase, TrainingError, TrainingSettings, TrainingState, curves};
 use crate::checkpoint::{self, Checkpoint, CheckpointSettings};
 use crate::learning::Adam;
 use crate::model::parameters::Parameters;
@@ -25,6 +26,24 @@ pub struct Run {
     folder: PathBuf,
     metrics: File,
     events: EventFile,
+}
+
+/// Where a run goes on.
+#[derive(Debug)]
+pub(super) enum GoesOn {
+    /// From the beginning: it died before its first checkpoint.
+    FromStart(Run),
+    /// From its newest checkpoint.
+    From {
+        /// Its folder.
+        run: Run,
+        /// The weights.
+        parameters: Parameters,
+        /// The counters.
+        state: TrainingState,
+        /// The optimisers' moments, under their keys.
+        moments: Tensors,
+    },
 }
 
 /// Whether a checkpoint is the best one so far, and so is kept apart from the newest.
@@ -56,11 +75,37 @@ impl Run {
         Self::open(folder, settings, 0)
     }
 
+    /// Goes on with the run in `folder`, which must be of one of these phases and of this model.
+    ///
+    /// # Errors
+    /// [`TrainingError::OtherPhase`], [`TrainingError::OtherModel`], or those of reading and writing.
+    pub(super) fn go_on(
+        folder: &Path,
+        settings: &TrainingSettings,
+        phases: &[Phase],
+        device: &Device,
+    ) -> Result<GoesOn, TrainingError> {
+        settings.validate()?;
+        if !phases.contains(&settings.phase) {
+            let found = settings.phase.verb();
+            return Err(TrainingError::OtherPhase { path: folder.to_path_buf(), found });
+        }
+        if !Self::has_checkpoint(folder) {
+            return Ok(GoesOn::FromStart(Self::resume(folder, settings, 0)?));
+        }
+        let (Checkpoint { settings: stored, parameters }, state, moments) = Self::load(folder, device)?;
+        if stored.model != settings.model {
+            return Err(TrainingError::OtherModel);
+        }
+        let run = Self::resume(folder, settings, state.updates)?;
+        Ok(GoesOn::From { run, parameters, state, moments })
+    }
+
     /// Goes on with a run: metrics beyond `updates` belong to updates that were lost, and are dropped.
     ///
     /// # Errors
     /// Those of reading and writing.
-    pub fn resume(folder: &Path, settings: &TrainingSettings, updates: u64) -> Result<Self, TrainingError> {
+    fn resume(folder: &Path, settings: &TrainingSettings, updates: u64) -> Result<Self, TrainingError> {
         #[derive(Deserialize)]
         struct Line {
             update: u64,
@@ -188,7 +233,7 @@ impl Run {
     pub fn load(
         folder: &Path,
         device: &Device,
-    ) -> Result<(Checkpoint, TrainingState, rcwm_models::tensors::Tensors), TrainingError> {
+    ) -> Result<(Checkpoint, TrainingState, Tensors), TrainingError> {
         let last = Self::last(folder);
         let checkpoint = Checkpoint::read(&last, device)?;
         let (state, moments) = TrainingState::read(&last, &checkpoint.settings.weights_sha256)?;
