@@ -6,7 +6,7 @@ mod support;
 use std::sync::atomic::AtomicBool;
 
 use candle_core::Device;
-use ndarray::{Array1, Array2, Array3, Array4};
+use ndarray::{Array2, Array3, Array4};
 use rcwm_models::episode::Episode;
 use rcwm_models::settings::ModelKind;
 use rcwm_trainer::evaluation::{
@@ -20,7 +20,6 @@ use rcwm_trainer::replay::Replay;
 /// A bright bar, the robot, that moves.
 fn episode(steps: usize, shift: usize, masked: bool) -> Episode {
     let inside = |t: usize, y: usize, x: usize| (8..24).contains(&y) && (x + t + shift) % 64 < 16;
-    let no = Array1::from_elem(steps, false);
     Episode {
         image: Array4::from_shape_fn(
             (steps, 64, 64, 3),
@@ -28,12 +27,8 @@ fn episode(steps: usize, shift: usize, masked: bool) -> Episode {
         ),
         action: Array2::from_shape_fn((steps, 4), |(t, i)| ((t * 3 + i) % 7) as f32 / 7.0),
         reward: (0..steps).map(|t| t as f32 * 0.1).collect(),
-        is_first: no.clone(),
-        is_last: no.clone(),
-        is_terminal: no.clone(),
-        success: no,
         robot_mask: masked.then(|| Array3::from_shape_fn((steps, 64, 64), |(t, y, x)| inside(t, y, x))),
-        proprio: None,
+        ..Episode::blank(steps)
     }
 }
 

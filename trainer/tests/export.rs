@@ -9,7 +9,7 @@ use std::path::Path;
 use std::sync::atomic::{AtomicUsize, Ordering};
 
 use assert_cmd::Command;
-use ndarray::{Array1, Array2, Array4};
+use ndarray::{Array2, Array4};
 use rcwm_models::bundle::{Bundle, MANIFEST_FILE, PartName};
 use rcwm_models::episode::Episode;
 use rcwm_models::onnx;
@@ -171,17 +171,10 @@ fn a_vanilla_model_is_refused() {
 fn golden_values_can_come_from_a_recorded_episode() {
     let folder = tempfile::tempdir().unwrap();
     let file = folder.path().join("episode.npz");
-    let no = || Array1::from_elem(4, false);
     let episode = Episode {
         image: Array4::from_shape_fn((4, 64, 64, 3), |(t, y, x, c)| (t * 40 + y + x + c) as u8),
         action: Array2::from_elem((4, 4), 0.5),
-        reward: Array1::zeros(4),
-        is_first: no(),
-        is_last: no(),
-        is_terminal: no(),
-        success: no(),
-        robot_mask: None,
-        proprio: None,
+        ..Episode::blank(4)
     };
     episode.write(&file).unwrap();
     let options = Options { golden_episode: Some(file), golden_ticks: 3, ..options() };

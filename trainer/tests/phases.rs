@@ -30,7 +30,6 @@ use rcwm_trainer::training::{
 /// A bright square that moves with the action, to and fro.
 fn episode(steps: usize, shift: usize, success: bool) -> Episode {
     let inside = |t: usize, y: usize, x: usize| (8..24).contains(&y) && (x + 64 - (t + shift) % 64) % 64 < 16;
-    let no = Array1::from_elem(steps, false);
     let flag = |at: usize, value: bool| Array1::from_shape_fn(steps, |t| value && t == at);
     Episode {
         image: Array4::from_shape_fn(
@@ -41,12 +40,9 @@ fn episode(steps: usize, shift: usize, success: bool) -> Episode {
             if t == 0 { 0.0 } else { 0.3 + 0.1 * i as f32 - 0.01 * t as f32 }
         }),
         reward: (0..steps).map(|t| t as f32 * 0.1).collect(),
-        is_first: flag(0, true),
         is_last: flag(steps - 1, true),
-        is_terminal: no.clone(),
         success: flag(steps / 2, success),
-        robot_mask: None,
-        proprio: None,
+        ..Episode::blank(steps)
     }
 }
 

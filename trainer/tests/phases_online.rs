@@ -34,17 +34,12 @@ fn pixel(step: usize, at: usize) -> u8 {
 
 /// A recorded episode.
 fn episode(steps: usize, success: bool) -> Episode {
-    let no = Array1::from_elem(steps, false);
     Episode {
         image: Array4::from_shape_fn((steps, 64, 64, 3), |(t, y, x, c)| pixel(t, (y * 64 + x) * 3 + c)),
         action: Array2::from_elem((steps, 4), 0.25),
         reward: (0..steps).map(|t| t as f32 * 0.1).collect(),
-        is_first: Array1::from_shape_fn(steps, |t| t == 0),
-        is_last: no.clone(),
-        is_terminal: no.clone(),
         success: Array1::from_elem(steps, success),
-        robot_mask: None,
-        proprio: None,
+        ..Episode::blank(steps)
     }
 }
 

@@ -7,7 +7,7 @@ use std::path::Path;
 use std::sync::atomic::{AtomicBool, Ordering};
 
 use candle_core::Device;
-use ndarray::{Array1, Array2, Array3, Array4};
+use ndarray::{Array2, Array3, Array4};
 use rcwm_models::episode::Episode;
 use rcwm_models::settings::{ModelKind, Preset};
 use rcwm_trainer::checkpoint::Checkpoint;
@@ -18,9 +18,6 @@ use rcwm_trainer::training::{Outcome, Pretraining, Progress, Run, TrainingError,
 /// A bright square, the robot, that moves over a dark ground with the action.
 fn episode(steps: usize, shift: usize, masked: bool) -> Episode {
     let inside = |t: usize, y: usize, x: usize| (8..24).contains(&y) && (x + 64 - (t + shift) % 64) % 64 < 16;
-    let no = Array1::from_elem(steps, false);
-    let mut is_first = no.clone();
-    is_first[0] = true;
     Episode {
         image: Array4::from_shape_fn(
             (steps, 64, 64, 3),
@@ -28,12 +25,8 @@ fn episode(steps: usize, shift: usize, masked: bool) -> Episode {
         ),
         action: Array2::from_elem((steps, 4), 0.5),
         reward: (0..steps).map(|t| t as f32 * 0.1).collect(),
-        is_first,
-        is_last: no.clone(),
-        is_terminal: no.clone(),
-        success: no,
         robot_mask: masked.then(|| Array3::from_shape_fn((steps, 64, 64), |(t, y, x)| inside(t, y, x))),
-        proprio: None,
+        ..Episode::blank(steps)
     }
 }
 

@@ -89,6 +89,23 @@ pub enum EpisodeError {
 }
 
 impl Episode {
+    /// `steps` black pictures with zero actions and rewards, no masks; the first step is marked as such.
+    #[must_use]
+    pub fn blank(steps: usize) -> Self {
+        let no = Array1::from_elem(steps, false);
+        Self {
+            image: Array4::zeros((steps, IMAGE_SIDE, IMAGE_SIDE, IMAGE_CHANNELS)),
+            action: Array2::zeros((steps, ACTION_LEN)),
+            reward: Array1::zeros(steps),
+            is_first: (0..steps).map(|step| step == 0).collect(),
+            is_last: no.clone(),
+            is_terminal: no.clone(),
+            success: no,
+            robot_mask: None,
+            proprio: None,
+        }
+    }
+
     /// Steps, `T`.
     #[must_use]
     pub fn len(&self) -> usize {

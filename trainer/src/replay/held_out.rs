@@ -46,21 +46,14 @@ fn spread(entries: &[usize], count: usize) -> Vec<usize> {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use ndarray::{Array1, Array2, Array3, Array4};
+    use ndarray::{Array1, Array3};
     use rcwm_models::episode::Episode;
 
     fn episode(reward: f32, masked: bool) -> Episode {
-        let no = Array1::from_elem(3, false);
         Episode {
-            image: Array4::zeros((3, 64, 64, 3)),
-            action: Array2::zeros((3, 4)),
             reward: Array1::from_elem(3, reward),
-            is_first: no.clone(),
-            is_last: no.clone(),
-            is_terminal: no.clone(),
-            success: no,
             robot_mask: masked.then(|| Array3::from_elem((3, 64, 64), true)),
-            proprio: None,
+            ..Episode::blank(3)
         }
     }
 

@@ -201,21 +201,10 @@ fn read_masks(folder: &Path, steps: usize) -> Result<Array3<bool>, LoadError> {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use ndarray::{Array1, Array2, Array4};
+    use ndarray::Array1;
 
     fn episode(steps: usize, reward: f32) -> Episode {
-        let no = Array1::from_elem(steps, false);
-        Episode {
-            image: Array4::zeros((steps, 64, 64, 3)),
-            action: Array2::zeros((steps, 4)),
-            reward: Array1::from_elem(steps, reward),
-            is_first: no.clone(),
-            is_last: no.clone(),
-            is_terminal: no.clone(),
-            success: no,
-            robot_mask: None,
-            proprio: None,
-        }
+        Episode { reward: Array1::from_elem(steps, reward), ..Episode::blank(steps) }
     }
 
     #[test]

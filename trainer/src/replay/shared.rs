@@ -62,21 +62,10 @@ impl SharedReplay {
 mod tests {
     use super::*;
     use crate::replay::Prefetch;
-    use ndarray::{Array1, Array2, Array4};
+    use ndarray::Array1;
 
     fn episode(reward: f32) -> Episode {
-        let no = Array1::from_elem(8, false);
-        Episode {
-            image: Array4::zeros((8, 64, 64, 3)),
-            action: Array2::zeros((8, 4)),
-            reward: Array1::from_elem(8, reward),
-            is_first: no.clone(),
-            is_last: no.clone(),
-            is_terminal: no.clone(),
-            success: no,
-            robot_mask: None,
-            proprio: None,
-        }
+        Episode { reward: Array1::from_elem(8, reward), ..Episode::blank(8) }
     }
 
     #[test]

@@ -257,23 +257,15 @@ fn check(task: &str, episode: &Episode) -> Result<(), ReplayError> {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use ndarray::{Array1, Array2, Array3, Array4};
+    use ndarray::{Array3, Array4};
 
     /// An episode whose rewards are `from`, `from + 1`, ...
     fn episode(from: usize, steps: usize, masked: bool) -> Episode {
-        let no = Array1::from_elem(steps, false);
-        let mut is_first = no.clone();
-        is_first[0] = true;
         Episode {
             image: Array4::from_shape_fn((steps, 64, 64, 3), |(t, ..)| (from + t) as u8),
-            action: Array2::zeros((steps, 4)),
             reward: (0..steps).map(|t| (from + t) as f32).collect(),
-            is_first,
-            is_last: no.clone(),
-            is_terminal: no.clone(),
-            success: no,
             robot_mask: masked.then(|| Array3::from_elem((steps, 64, 64), true)),
-            proprio: None,
+            ..Episode::blank(steps)
         }
     }
 
