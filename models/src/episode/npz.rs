@@ -97,8 +97,11 @@ impl Reader<'_> {
 
 /// Parses an episode's archive; `path` is for messages.
 pub(super) fn read(path: &Path, bytes: &[u8]) -> Result<Episode, EpisodeError> {
-    let archive = ZipArchive::new(Cursor::new(bytes))
-        .map_err(|error| EpisodeError::Archive { path: path.to_path_buf(), reason: error.to_string() })?;
+    let broken = |error| EpisodeError::Archive {
+        path: path.to_path_buf(),
+        reason: format!("no whole archive of arrays ({error}); remove it or record it again"),
+    };
+    let archive = ZipArchive::new(Cursor::new(bytes)).map_err(broken)?;
     let mut reader = Reader { path, archive };
     let image = read_images(&mut reader)?;
     let steps = image.shape()[0];

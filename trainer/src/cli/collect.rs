@@ -2,7 +2,7 @@ use std::path::PathBuf;
 use std::process::ExitCode;
 use std::time::{Duration, Instant};
 
-use anyhow::{Result, ensure};
+use anyhow::{Context, Result, ensure};
 use indicatif::{ProgressBar, ProgressStyle};
 use rcwm_models::tasks::{DOWNSTREAM, UPSTREAM, task_id};
 use rcwm_trainer::simulators::{Amounts, CollectSettings, Collected, Plan, Seen, Sums, collect, record};
@@ -99,7 +99,8 @@ impl Collect {
         };
         let plan = Plan::new(&self.out, &tasks, &amounts, self.seed, EPISODES_A_RUN);
         let bar = bar(plan.episodes(), self.steps_max)?;
-        let sums = collect(&plan, &settings, stop, &|seen| advance(&bar, seen))?;
+        let sums = collect(&plan, &settings, stop, &|seen| advance(&bar, seen))
+            .context("collecting stopped; whole episodes are kept and the same command goes on")?;
         bar.finish_and_clear();
         Ok((sums, plan.present))
     }

@@ -54,6 +54,16 @@ pub enum ClosedLoopError {
         /// What is wrong.
         source: serde_json::Error,
     },
+    /// A simulator was ended from outside: a rate over what it had done would not be that of the layouts asked for.
+    #[error(
+        "{found} of {expected} episodes were finished, a simulator was stopped from outside; run it again"
+    )]
+    Short {
+        /// Episodes finished.
+        found: u64,
+        /// Episodes asked for.
+        expected: u64,
+    },
     /// It was stopped.
     #[error("interrupted; the simulators and runtimes were ended")]
     Interrupted,
@@ -166,6 +176,10 @@ pub fn closed_loop(
         std::thread::sleep(LOOK);
     }
     let served = pairs.iter().map(|pair| read_json(&pair.served)).collect::<Result<Vec<Served>, _>>()?;
+    let found = served.iter().map(|served| served.successful.len() as u64).sum();
+    if found != settings.episodes {
+        return Err(ClosedLoopError::Short { found, expected: settings.episodes });
+    }
     let runtimes = pairs.iter().map(|pair| read_json(&pair.ran)).collect::<Result<_, _>>()?;
     Ok(ClosedLoopReport::new(settings.clone(), &served, runtimes, begin.elapsed()))
 }
