@@ -8,7 +8,7 @@ EPISODES ?= 2
 OUT ?= runs/demo
 BIN = $${CARGO_TARGET_DIR:-target}/release
 
-.PHONY: help demo test lint bench clean
+.PHONY: help demo test lint clean
 
 help: ## What there is
 	@grep -hE '^[a-z-]+:.*##' $(MAKEFILE_LIST) | sed -E 's/:.*## /\t/' | expand -t 10

@@ -14,7 +14,7 @@ pub enum SimulatorError {
     UnknownTask(#[from] UnknownTask),
     /// A Python package is not installed.
     #[error(
-        "the Python package {package:?} is missing in {venv}: run `make setup`, or `{venv}/bin/python -m pip install \
+        "the Python package {package:?} is missing in {venv}: run `scripts/setup demo`, or `{venv}/bin/python -m pip install \
          --require-hashes -r trainer/simulator/requirements.txt`"
     )]
     MissingPackage {
@@ -35,7 +35,7 @@ pub enum SimulatorError {
     },
     /// The virtual environment has no interpreter.
     #[error(
-        "no Python interpreter at {path}: run `make setup`, or name a virtual environment in RCWM_PYTHON_VENV"
+        "no Python interpreter at {path}: run `scripts/setup demo`, or name a virtual environment in RCWM_PYTHON_VENV"
     )]
     NoInterpreter {
         /// The interpreter that was expected.

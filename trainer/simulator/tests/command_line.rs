@@ -57,7 +57,7 @@ fn a_virtual_environment_without_the_packages_ends_with_the_line_that_installs_t
         .unwrap();
     let text = failure(&output);
     assert!(
-        text.contains("numpy") && text.contains("make setup") && text.contains("requirements.txt"),
+        text.contains("numpy") && text.contains("scripts/setup demo") && text.contains("requirements.txt"),
         "{text}"
     );
 }
