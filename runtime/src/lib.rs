@@ -18,10 +18,11 @@
 //!
 //! let mut policy = Policy::load("models/bundles/debug".as_ref(), EngineSettings::tract())?;
 //! let image = vec![0_u8; rcwm_models::IMAGE_BYTES]; // 64 x 64 x 3, upright, RGB
-//! let mut executed = [0.0; rcwm_models::ACTION_LEN];
-//! for step in 0..250 {
-//!     let decision = policy.observe(&image, &executed, step == 0)?;
-//!     executed = decision.action; // send it to the robot; report what was really executed
+//! let mut executed = None; // nothing yet: an episode starts
+//! for _ in 0..250 {
+//!     let decision = policy.observe(&image, executed.as_ref())?;
+//!     executed = Some(decision.action); // send it to the robot; report what was really executed
+//!     policy.work_ahead(executed.as_ref())?; // in the idle time: what the next tick needs besides the image
 //! }
 //! # Ok::<(), rcwm_runtime::PolicyError>(())
 //! ```

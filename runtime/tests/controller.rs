@@ -24,7 +24,7 @@ fn every_observation_is_answered_with_what_the_policy_decides() {
         sent.episode = sequence / 20;
         sent.flags |= if step == 19 { ObservationFlags::LAST.0 } else { 0 };
         let action = ask(&peer, &sent);
-        let expected = policy.observe(&image(step), &sent.executed_action, step == 0).unwrap();
+        let expected = policy.observe(&image(step), (step > 0).then_some(&sent.executed_action)).unwrap();
         assert_eq!(action.action, expected.action, "sequence {sequence}");
         assert_eq!(action.source, ActionSource::Policy as u32);
     }

@@ -13,7 +13,9 @@ use support::{image, smallest_bundle, with_nan_weight};
 const EXECUTED: [f32; 4] = [0.1, -0.4, 0.2, -1.0];
 
 fn run(policy: &mut Policy, steps: u32) -> Vec<[f32; 4]> {
-    (0..steps).map(|step| policy.observe(&image(step), &EXECUTED, step == 0).unwrap().action).collect()
+    (0..steps)
+        .map(|step| policy.observe(&image(step), (step > 0).then_some(&EXECUTED)).unwrap().action)
+        .collect()
 }
 
 #[test]
@@ -26,14 +28,14 @@ fn an_episode_starts_from_the_same_state_every_time() {
 #[test]
 fn the_executed_action_matters_except_at_the_first_of_an_episode() {
     let mut policy = Policy::load(&smallest_bundle(), EngineSettings::tract()).unwrap();
-    policy.observe(&image(0), &EXECUTED, true).unwrap();
+    policy.observe(&image(0), None).unwrap();
     let start = policy.state().clone();
-    policy.observe(&image(0), &[1.0; 4], true).unwrap();
+    policy.observe(&image(0), None).unwrap();
     assert_eq!(*policy.state(), start);
-    policy.observe(&image(1), &EXECUTED, false).unwrap();
+    policy.observe(&image(1), Some(&EXECUTED)).unwrap();
     let moved = policy.state().clone();
     policy.set_state(&start).unwrap();
-    policy.observe(&image(1), &[1.0; 4], false).unwrap();
+    policy.observe(&image(1), Some(&[1.0; 4])).unwrap();
     assert_ne!(policy.state().robot.h, moved.robot.h);
 }
 
@@ -55,9 +57,9 @@ fn what_is_unfit_is_refused_and_leaves_the_state_alone() {
     let mut policy = Policy::load(&smallest_bundle(), EngineSettings::tract()).unwrap();
     run(&mut policy, 3);
     let before = policy.state().clone();
-    let short = policy.observe(&[0; IMAGE_BYTES - 1], &EXECUTED, false);
+    let short = policy.observe(&[0; IMAGE_BYTES - 1], Some(&EXECUTED));
     assert!(matches!(short, Err(PolicyError::Observation(_))));
-    let infinite = policy.observe(&image(3), &[f32::INFINITY, 0.0, 0.0, 0.0], false);
+    let infinite = policy.observe(&image(3), Some(&[f32::INFINITY, 0.0, 0.0, 0.0]));
     assert!(matches!(infinite, Err(PolicyError::Observation(_))));
     assert_eq!(*policy.state(), before);
 }
@@ -73,4 +75,38 @@ fn weights_that_are_no_numbers_are_refused_before_they_run() {
         };
         assert!(error.to_string().contains(part.as_str()), "{error}");
     }
+}
+
+#[test]
+fn work_done_ahead_changes_nothing_but_when_it_is_done() {
+    let bundle = Bundle::open(&smallest_bundle()).unwrap();
+    for sampling in [Sampling::Mode, Sampling::Sample { seed: 5 }] {
+        let fresh = || Policy::new(&bundle, EngineSettings::tract(), sampling).unwrap();
+        let expected = run(&mut fresh(), 8);
+        let mut ahead = fresh();
+        for (step, expected) in (0..).zip(&expected) {
+            let executed = (step > 0).then_some(&EXECUTED);
+            ahead.work_ahead(executed).unwrap();
+            let decision = ahead.observe(&image(step), executed).unwrap();
+            assert_eq!((decision.action, decision.recomputed), (*expected, false));
+        }
+        let mut wrong = fresh();
+        for (step, expected) in (0..).zip(&expected) {
+            wrong.work_ahead((step > 0).then_some(&[-0.9; 4])).unwrap();
+            let decision = wrong.observe(&image(step), (step > 0).then_some(&EXECUTED)).unwrap();
+            assert_eq!((decision.action, decision.recomputed), (*expected, step > 0));
+        }
+    }
+}
+
+#[test]
+fn an_imagined_frame_moves_the_state_and_has_no_surprise() {
+    let mut policy = Policy::load(&smallest_bundle(), EngineSettings::tract()).unwrap();
+    let seen = policy.observe(&image(0), None).unwrap();
+    assert!(seen.surprise.is_some_and(|surprise| surprise.robot > 0.0 && surprise.environment > 0.0));
+    let before = policy.state().clone();
+    let imagined = policy.imagine(&EXECUTED).unwrap();
+    assert_eq!(imagined.surprise, None);
+    assert_eq!(policy.state().robot.z, policy.buffers().robot.prior_z);
+    assert_ne!(*policy.state(), before);
 }

@@ -259,7 +259,7 @@ impl Controller {
             self.counters.refused_observations += 1;
             return None;
         }
-        match self.policy.observe(&observation.image, &observation.executed_action, is_first) {
+        match self.policy.observe(&observation.image, (!is_first).then_some(&observation.executed_action)) {
             Ok(decision) => {
                 for (stage, time_ns) in Stage::POLICY.into_iter().zip(decision.stage_ns) {
                     self.telemetry.record(stage, time_ns);

@@ -13,21 +13,24 @@
 mod limits;
 mod noise;
 mod parts;
+mod sequential;
+mod stages;
 mod state;
 
 pub use limits::ActionLimits;
 pub use noise::Sampling;
-pub use parts::{BranchBuffers, Buffers, Parts};
+pub use parts::{BranchBuffers, Buffers};
 pub use state::{BranchState, State};
 
 use std::path::Path;
-use std::time::Instant;
 
 use rcwm_models::bundle::{Bundle, BundleError, Manifest, PartName};
 use rcwm_models::{ACTION_LEN, IMAGE_BYTES};
 
 use crate::engine::{EngineError, EngineSettings};
 use noise::NoiseSource;
+use sequential::Sequential;
+use stages::StageClock;
 
 /// Why there is no policy, or no decision.
 #[derive(Debug, thiserror::Error)]
@@ -54,6 +57,16 @@ pub enum PolicyError {
 /// Stages of a tick that are timed one by one, in the order they run.
 pub const STAGES: [PartName; 5] = PartName::REQUIRED;
 
+/// How far what was observed is from what was expected, per branch: `KL[q || p]` of posterior against prior in nats, summed over
+/// the categoricals. The robot's says "my arm does not move as I expect", the environment's "the scene changed".
+#[derive(Debug, Clone, Copy, PartialEq, Default, serde::Serialize)]
+pub struct Surprise {
+    /// Robot branch.
+    pub robot: f32,
+    /// Environment branch.
+    pub environment: f32,
+}
+
 /// What the policy decided on one observation.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct Decision {
@@ -63,19 +76,34 @@ pub struct Decision {
     pub mean: [f32; ACTION_LEN],
     /// Its standard deviation.
     pub std: [f32; ACTION_LEN],
-    /// Time spent in each of [`STAGES`], in ns.
+    /// Time spent in each of [`STAGES`] after the image was there, in ns; 0 for one that had been worked ahead.
     pub stage_ns: [u64; STAGES.len()],
+    /// How unexpected the image was; none where there was no image ([`Policy::imagine`]).
+    pub surprise: Option<Surprise>,
+    /// What had been worked ahead was for another action than was executed, and was done again.
+    pub recomputed: bool,
+}
+
+/// What led to the observation to come.
+#[derive(Debug, Clone, Copy, PartialEq)]
+enum Before {
+    /// Nothing: it is the first of its episode.
+    Start,
+    /// This action.
+    Action([f32; ACTION_LEN]),
 }
 
 /// A policy that carries its state from tick to tick.
 pub struct Policy {
     manifest: Manifest,
     limits: ActionLimits,
-    parts: Parts,
+    parts: Sequential,
     buffers: Buffers,
     initial: State,
     state: State,
     noise: NoiseSource,
+    /// What the buffers hold the work ahead for.
+    ahead: Option<Before>,
 }
 
 impl Policy {
@@ -96,12 +124,13 @@ impl Policy {
         let initial = State::from(&bundle.initial);
         let mut policy = Self {
             limits: ActionLimits::of(&bundle.manifest.control),
-            parts: Parts::load(bundle, engine)?,
+            parts: Sequential::load(bundle, engine)?,
             buffers: Buffers::new(model),
             state: initial.clone(),
             initial,
             noise: NoiseSource::new(sampling, model),
             manifest: bundle.manifest.clone(),
+            ahead: None,
         };
         policy.warm_up(sampling)?;
         Ok(policy)
@@ -111,21 +140,22 @@ impl Policy {
     fn warm_up(&mut self, sampling: Sampling) -> Result<(), PolicyError> {
         let image = vec![0; IMAGE_BYTES];
         for tick in 0..3 {
-            match self.observe(&image, &[0.0; ACTION_LEN], tick == 0) {
+            match self.observe(&image, (tick > 0).then_some(&[0.0; ACTION_LEN])) {
                 // Poisoned weights must not stop a controller that has a fallback: they are reported tick by tick.
                 Ok(_) | Err(PolicyError::NotFinite { .. }) => {}
                 Err(error) => return Err(error),
             }
         }
         self.noise = NoiseSource::new(sampling, &self.manifest.model);
+        self.ahead = None;
         self.reset();
         Ok(())
     }
 
     /// Decides on one observation and carries the state on.
     ///
-    /// `image` is 64 x 64 x 3, upright, RGB; `executed_action` is what was executed to get here and is ignored where
-    /// `is_first`, which starts from the learned initial state.
+    /// `image` is 64 x 64 x 3, upright, RGB; `executed_action` is what was really executed to get here, and none at the first
+    /// observation of an episode, which starts from the learned initial state.
     ///
     /// # Errors
     /// [`PolicyError::Observation`], [`PolicyError::Engine`] or [`PolicyError::NotFinite`]; the carried state is then that of
@@ -133,64 +163,105 @@ impl Policy {
     pub fn observe(
         &mut self,
         image: &[u8],
-        executed_action: &[f32; ACTION_LEN],
-        is_first: bool,
+        executed_action: Option<&[f32; ACTION_LEN]>,
     ) -> Result<Decision, PolicyError> {
         if image.len() != IMAGE_BYTES {
+            let found = image.len();
             return Err(PolicyError::Observation(format!(
-                "the image has {} bytes, expected {IMAGE_BYTES}",
-                image.len()
+                "the image has {found} bytes, expected {IMAGE_BYTES}"
             )));
         }
-        if executed_action.iter().any(|x| !x.is_finite()) {
-            return Err(PolicyError::Observation(format!(
-                "executed action {executed_action:?} is not finite"
-            )));
-        }
-        if is_first {
+        let before = Self::before(executed_action)?;
+        if before == Before::Start {
             self.reset();
         }
-        let action = if is_first { [0.0; ACTION_LEN] } else { *executed_action };
-        self.noise.draw();
-        let stage_ns = self.run_stages(image, &action)?;
-        self.state.take_posterior(&self.buffers);
-        Ok(self.decide(stage_ns))
-    }
-
-    fn run_stages(
-        &mut self,
-        image: &[u8],
-        action: &[f32; ACTION_LEN],
-    ) -> Result<[u64; STAGES.len()], PolicyError> {
+        let mut clock = StageClock::start();
+        let recomputed = self.prepare(before, &mut clock)?;
         let Self { parts, buffers, state, noise, .. } = self;
-        let mut stage_ns = [0; STAGES.len()];
-        let mut last = Instant::now();
-        for (stage, spent) in STAGES.into_iter().zip(&mut stage_ns) {
-            match stage {
-                PartName::Encoder => parts.run_encoder(image, buffers)?,
-                PartName::Robot => parts.run_robot(&state.robot, action, noise.robot(), buffers)?,
-                PartName::Interaction => parts.run_interaction(&state.environment, buffers)?,
-                PartName::Environment => {
-                    parts.run_environment(&state.environment, noise.environment(), buffers)?
-                }
-                _ => parts.run_actor(buffers)?,
-            }
-            let now = Instant::now();
-            *spent = now.duration_since(last).as_nanos() as u64;
-            last = now;
-        }
-        Ok(stage_ns)
+        // From here on the buffers hold a tick that may fail half-way.
+        self.ahead = None;
+        parts.observe(image, state, noise, buffers, &mut clock)?;
+        self.state.take_posterior(&self.buffers);
+        let surprise = Some(self.buffers.surprise());
+        Ok(self.decide(clock.spent_ns, surprise, recomputed))
     }
 
-    fn decide(&mut self, stage_ns: [u64; STAGES.len()]) -> Decision {
+    /// Computes all of the next tick that needs only the action before it (robot prior, interaction, environment's recurrence),
+    /// as if `action` were executed: to be called in the idle time after an action was sent. `None` is for an episode's start, and
+    /// goes back to the learned initial state. When [`Self::observe`] then gets the same action, it has that much less to do.
+    ///
+    /// # Errors
+    /// As [`Self::observe`].
+    pub fn work_ahead(&mut self, action: Option<&[f32; ACTION_LEN]>) -> Result<(), PolicyError> {
+        let before = Self::before(action)?;
+        if before == Before::Start {
+            self.reset();
+        }
+        self.prepare(before, &mut StageClock::start()).map(drop)
+    }
+
+    /// Goes on without an image: the world model imagines the missing frame. The prior stands in for the posterior, and the state is
+    /// carried on from it.
+    ///
+    /// # Errors
+    /// As [`Self::observe`].
+    pub fn imagine(&mut self, executed_action: &[f32; ACTION_LEN]) -> Result<Decision, PolicyError> {
+        let before = Self::before(Some(executed_action))?;
+        let mut clock = StageClock::start();
+        let recomputed = self.prepare(before, &mut clock)?;
+        let Self { parts, buffers, state, noise, .. } = self;
+        self.ahead = None;
+        parts.imagine(state, noise, buffers, &mut clock)?;
+        self.state.take_posterior(&self.buffers);
+        Ok(self.decide(clock.spent_ns, None, recomputed))
+    }
+
+    fn before(action: Option<&[f32; ACTION_LEN]>) -> Result<Before, PolicyError> {
+        match action {
+            None => Ok(Before::Start),
+            Some(action) if action.iter().all(|x| x.is_finite()) => Ok(Before::Action(*action)),
+            Some(action) => {
+                Err(PolicyError::Observation(format!("executed action {action:?} is not finite")))
+            }
+        }
+    }
+
+    /// Makes the buffers hold what is known before the image; true when they held it for another action.
+    fn prepare(&mut self, before: Before, clock: &mut StageClock) -> Result<bool, PolicyError> {
+        if self.ahead == Some(before) {
+            return Ok(false);
+        }
+        let other = self.ahead.take().is_some();
+        if !other {
+            // Done again, a tick keeps its noise: one draw a tick, whatever was assumed.
+            self.noise.draw();
+        }
+        let action = match before {
+            Before::Start => [0.0; ACTION_LEN],
+            Before::Action(action) => action,
+        };
+        let Self { parts, buffers, state, noise, .. } = self;
+        parts.work_ahead(state, &action, noise, buffers, clock)?;
+        self.ahead = Some(before);
+        Ok(other)
+    }
+
+    fn decide(
+        &mut self,
+        stage_ns: [u64; STAGES.len()],
+        surprise: Option<Surprise>,
+        recomputed: bool,
+    ) -> Decision {
         let (mean, std) = (self.buffers.mean, self.buffers.std);
         let action = self.limits.clamp(self.noise.action(&mean, &std));
-        Decision { action, mean, std, stage_ns }
+        Decision { action, mean, std, stage_ns, surprise, recomputed }
     }
 
     /// Goes back to the learned initial state.
-    pub fn reset(&mut self) {
-        self.state.clone_from(&self.initial);
+    fn reset(&mut self) {
+        if self.state != self.initial {
+            self.state.clone_from(&self.initial);
+        }
     }
 
     /// The state carried into the next tick: posterior z and h of both branches.
@@ -208,6 +279,7 @@ impl Policy {
             return Err(PolicyError::Observation("the state is of another model's size".into()));
         }
         self.state.clone_from(state);
+        self.ahead = None;
         Ok(())
     }
 
@@ -223,6 +295,7 @@ impl Policy {
     /// # Errors
     /// [`PolicyError::Observation`] when a length is not `2 n m`.
     pub fn set_noise(&mut self, robot: &[f32], environment: &[f32]) -> Result<(), PolicyError> {
+        self.ahead = None;
         self.noise.set(robot, environment)
     }
 

@@ -4,7 +4,7 @@ use rcwm_models::ACTION_LEN;
 use rcwm_models::bundle::{Bundle, PartName};
 use rcwm_models::settings::ModelSettings;
 
-use super::{BranchState, PolicyError};
+use super::{BranchState, PolicyError, Surprise};
 use crate::engine::{self, EngineError, EngineSettings, Input, Output, Part};
 
 /// What a branch computes in a tick.
@@ -66,7 +66,27 @@ impl Buffers {
     }
 }
 
+impl Buffers {
+    pub(super) fn surprise(&self) -> Surprise {
+        Surprise { robot: self.robot.surprise(), environment: self.environment.surprise() }
+    }
+
+    /// The prior stands in for the posterior, as where there is no image.
+    pub(super) fn believe_prior(&mut self) {
+        for branch in [&mut self.robot, &mut self.environment] {
+            branch.posterior_z.copy_from_slice(&branch.prior_z);
+            branch.posterior_log_probs.copy_from_slice(&branch.prior_log_probs);
+        }
+    }
+}
+
 impl BranchBuffers {
+    /// `KL[q || p]` of the posterior against the prior, in nats, summed over the categoricals.
+    fn surprise(&self) -> f32 {
+        let pairs = self.posterior_log_probs.iter().zip(&self.prior_log_probs);
+        pairs.map(|(q, p)| q.exp() * (q - p)).sum()
+    }
+
     fn outputs(&mut self) -> [Output<'_>; 5] {
         [
             Output::F32(&mut self.h_next),

@@ -1,0 +1,29 @@
+//! The time that each stage of a tick takes.
+
+use std::time::Instant;
+
+use rcwm_models::bundle::PartName;
+
+use super::STAGES;
+
+/// Adds up the time between one look and the next, per stage.
+pub(super) struct StageClock {
+    last: Instant,
+    /// Time spent in each of [`STAGES`], in ns.
+    pub(super) spent_ns: [u64; STAGES.len()],
+}
+
+impl StageClock {
+    pub(super) fn start() -> Self {
+        Self { last: Instant::now(), spent_ns: [0; STAGES.len()] }
+    }
+
+    /// The stage has ended now.
+    pub(super) fn ended(&mut self, stage: PartName) {
+        let now = Instant::now();
+        if let Some(index) = STAGES.iter().position(|name| *name == stage) {
+            self.spent_ns[index] += now.duration_since(self.last).as_nanos() as u64;
+        }
+        self.last = now;
+    }
+}
