@@ -3,6 +3,10 @@
 //! | module | holds |
 //! | --- | --- |
 //! | [`engine`] | what runs an ONNX part: tract, or ONNX Runtime (feature `ort`) |
+//! | [`mod@compile`] | the exported parts as one graph, its hot nodes fused, cut where the image comes in |
+//! | [`operators`] | our operators in tract, which the fused nodes become |
+//! | [`team`] | a second thread for the tick |
+//! | [`kernels`] | convolution, products, norms and latents for vector registers |
 //! | [`policy`] | one tick: image and executed action in, action distribution out; carries z and h of both branches |
 //! | [`controller`] | the loop over shared memory: order of observations, fallback, action limits, counters |
 //! | [`telemetry`] | latency histograms, one per stage |
@@ -31,11 +35,15 @@
 
 pub mod bench;
 pub mod cli;
+pub mod compile;
 pub mod controller;
 pub mod engine;
 pub mod inspect;
+pub mod kernels;
+pub mod operators;
 pub mod policy;
 pub mod record;
+pub mod team;
 pub mod telemetry;
 pub mod verify;
 

@@ -32,9 +32,9 @@ pub(super) struct RunArguments {
     /// Engine that runs the parts
     #[arg(long, value_enum, default_value = "tract")]
     engine: EngineKind,
-    /// Threads inside an operator (ort only)
-    #[arg(long, value_name = "N", default_value_t = 1, value_parser = clap::value_parser!(u16).range(1..=64))]
-    threads: u16,
+    /// Threads of a tick: of tract 1 or 2 (by default 2 where there are two cores), of ort those inside an operator
+    #[arg(long, value_name = "N", value_parser = clap::value_parser!(u16).range(1..=64))]
+    threads: Option<u16>,
     /// Ends after this many whole episodes
     #[arg(long, value_name = "N", value_parser = clap::value_parser!(u64).range(1..))]
     episodes: Option<u64>,
@@ -77,7 +77,7 @@ fn seconds(text: &str) -> Result<f64, String> {
 pub(super) fn run(arguments: &RunArguments) -> anyhow::Result<()> {
     let stop = super::stop_flag()?;
     let bundle = super::open_bundle(&arguments.bundle)?;
-    let engine = EngineSettings { kind: arguments.engine, threads: usize::from(arguments.threads) };
+    let engine = EngineSettings::of(arguments.engine, arguments.threads);
     let sampling = match arguments.sample {
         true => Sampling::Sample { seed: arguments.seed },
         false => Sampling::Mode,

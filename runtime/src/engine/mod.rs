@@ -6,10 +6,12 @@
 #[cfg(feature = "ort")]
 mod onnxruntime;
 mod tract;
-mod weights;
+pub(crate) mod weights;
 
 use rcwm_models::bundle::{Bundle, DType, PartName, TensorSpec};
 use serde::Serialize;
+
+use crate::compile::Optimizations;
 
 /// Which engine.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Hash, Serialize, clap::ValueEnum)]
@@ -38,32 +40,71 @@ impl std::fmt::Display for EngineKind {
     }
 }
 
+/// What is run of a bundle.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize)]
+#[serde(rename_all = "snake_case")]
+pub enum Form {
+    /// The parts as exported, one after another once the image is there.
+    Exported,
+    /// Their segments, ahead of the image where they can be, with our operators in place of hot nodes; tract only.
+    Compiled(Optimizations),
+}
+
 /// Which engine, and how much of the machine it may use.
-#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize)]
 pub struct EngineSettings {
     /// Which engine.
     pub kind: EngineKind,
-    /// Threads inside an operator; tract always uses one.
+    /// Threads of a tick: of tract 1 or 2, of ONNX Runtime those inside an operator.
     pub threads: usize,
+    /// What is run.
+    pub form: Form,
 }
 
 impl EngineSettings {
-    /// tract.
+    /// tract as it is deployed: the compiled tick, on two threads where the machine has them.
     #[must_use]
-    pub const fn tract() -> Self {
-        Self { kind: EngineKind::Tract, threads: 1 }
+    pub fn tract() -> Self {
+        let cores = std::thread::available_parallelism().map_or(1, usize::from);
+        Self { threads: cores.min(2), ..Self::single_threaded(EngineKind::Tract) }
     }
 
-    /// ONNX Runtime with this many threads inside an operator.
+    /// ONNX Runtime with this many threads inside an operator, on the exported parts.
     #[must_use]
     pub const fn ort(threads: usize) -> Self {
-        Self { kind: EngineKind::Ort, threads }
+        Self { kind: EngineKind::Ort, threads, form: Form::Exported }
     }
 
     /// An engine with one thread.
     #[must_use]
     pub const fn single_threaded(kind: EngineKind) -> Self {
-        Self { kind, threads: 1 }
+        let form = match kind {
+            EngineKind::Tract => Form::Compiled(Optimizations::EXACT),
+            EngineKind::Ort => Form::Exported,
+        };
+        Self { kind, threads: 1, form }
+    }
+
+    /// An engine as it is deployed, perhaps with another number of threads.
+    #[must_use]
+    pub fn of(kind: EngineKind, threads: Option<u16>) -> Self {
+        let usual = match kind {
+            EngineKind::Tract => Self::tract(),
+            EngineKind::Ort => Self::ort(1),
+        };
+        threads.map_or(usual, |threads| usual.with_threads(threads.into()))
+    }
+
+    /// With another number of threads.
+    #[must_use]
+    pub const fn with_threads(self, threads: usize) -> Self {
+        Self { threads, ..self }
+    }
+
+    /// With another form.
+    #[must_use]
+    pub const fn with_form(self, form: Form) -> Self {
+        Self { form, ..self }
     }
 }
 
@@ -284,7 +325,7 @@ impl Border {
     }
 }
 
-fn one_line(text: &str) -> String {
+pub(crate) fn one_line(text: &str) -> String {
     text.split_whitespace().collect::<Vec<_>>().join(" ")
 }
 

@@ -13,7 +13,7 @@ use super::EngineError;
 const WEIGHT_MAX: f32 = 1e6;
 
 /// Checks every float constant of a part.
-pub(super) fn check(part: PartName, bytes: &[u8]) -> Result<(), EngineError> {
+pub(crate) fn check(part: PartName, bytes: &[u8]) -> Result<(), EngineError> {
     let model = onnx::parse_self_contained(bytes).map_err(|error| EngineError::Weights {
         part,
         tensor: "the graph".into(),

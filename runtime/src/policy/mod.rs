@@ -1,5 +1,7 @@
 //! One tick of the policy: image and executed action in, action distribution out.
 //!
+//! `sequential` runs the exported parts as they are, `compiled` their segments, which work ahead of the image.
+//!
 //! With `z` and `h` carried from the last tick (posterior z, spec section 1):
 //!
 //! ```text
@@ -10,12 +12,14 @@
 //! mean, std       = actor(z^R, h^R, z^E, h^E)
 //! ```
 
+mod compiled;
 mod limits;
 mod noise;
 mod parts;
 mod sequential;
 mod stages;
 mod state;
+mod tick;
 
 pub use limits::ActionLimits;
 pub use noise::Sampling;
@@ -27,10 +31,11 @@ use std::path::Path;
 use rcwm_models::bundle::{Bundle, BundleError, Manifest, PartName};
 use rcwm_models::{ACTION_LEN, IMAGE_BYTES};
 
+use crate::compile::CompileError;
 use crate::engine::{EngineError, EngineSettings};
 use noise::NoiseSource;
-use sequential::Sequential;
 use stages::StageClock;
+use tick::Tick;
 
 /// Why there is no policy, or no decision.
 #[derive(Debug, thiserror::Error)]
@@ -41,6 +46,12 @@ pub enum PolicyError {
     /// An engine could not load or run a part.
     #[error(transparent)]
     Engine(#[from] EngineError),
+    /// The parts could not be made into a tick.
+    #[error(transparent)]
+    Compile(#[from] CompileError),
+    /// The second thread could not be started.
+    #[error("starting the tick's second thread: {0}; use --threads 1")]
+    Thread(String),
     /// What was observed is not fit for the policy.
     #[error("observation refused: {0}")]
     Observation(String),
@@ -97,7 +108,7 @@ enum Before {
 pub struct Policy {
     manifest: Manifest,
     limits: ActionLimits,
-    parts: Sequential,
+    tick: Box<dyn Tick>,
     buffers: Buffers,
     initial: State,
     state: State,
@@ -124,7 +135,7 @@ impl Policy {
         let initial = State::from(&bundle.initial);
         let mut policy = Self {
             limits: ActionLimits::of(&bundle.manifest.control),
-            parts: Sequential::load(bundle, engine)?,
+            tick: tick::load(bundle, engine)?,
             buffers: Buffers::new(model),
             state: initial.clone(),
             initial,
@@ -177,10 +188,10 @@ impl Policy {
         }
         let mut clock = StageClock::start();
         let recomputed = self.prepare(before, &mut clock)?;
-        let Self { parts, buffers, state, noise, .. } = self;
+        let Self { tick, buffers, state, noise, .. } = self;
         // From here on the buffers hold a tick that may fail half-way.
         self.ahead = None;
-        parts.observe(image, state, noise, buffers, &mut clock)?;
+        tick.observe(image, state, noise, buffers, &mut clock)?;
         self.state.take_posterior(&self.buffers);
         let surprise = Some(self.buffers.surprise());
         Ok(self.decide(clock.spent_ns, surprise, recomputed))
@@ -200,6 +211,11 @@ impl Policy {
         self.prepare(before, &mut StageClock::start()).map(drop)
     }
 
+    /// Says that an image is about to come: a second thread, where there is one, gets ready.
+    pub fn expect_image(&self) {
+        self.tick.wake();
+    }
+
     /// Goes on without an image: the world model imagines the missing frame. The prior stands in for the posterior, and the state is
     /// carried on from it.
     ///
@@ -209,9 +225,9 @@ impl Policy {
         let before = Self::before(Some(executed_action))?;
         let mut clock = StageClock::start();
         let recomputed = self.prepare(before, &mut clock)?;
-        let Self { parts, buffers, state, noise, .. } = self;
+        let Self { tick, buffers, state, noise, .. } = self;
         self.ahead = None;
-        parts.imagine(state, noise, buffers, &mut clock)?;
+        tick.imagine(state, noise, buffers, &mut clock)?;
         self.state.take_posterior(&self.buffers);
         Ok(self.decide(clock.spent_ns, None, recomputed))
     }
@@ -240,8 +256,8 @@ impl Policy {
             Before::Start => [0.0; ACTION_LEN],
             Before::Action(action) => action,
         };
-        let Self { parts, buffers, state, noise, .. } = self;
-        parts.work_ahead(state, &action, noise, buffers, clock)?;
+        let Self { tick, buffers, state, noise, .. } = self;
+        tick.work_ahead(state, &action, noise, buffers, clock)?;
         self.ahead = Some(before);
         Ok(other)
     }

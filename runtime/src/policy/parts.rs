@@ -1,11 +1,13 @@
 //! The five parts of a tick and the buffers between them.
 
+use pulp::Arch;
 use rcwm_models::ACTION_LEN;
 use rcwm_models::bundle::{Bundle, PartName};
 use rcwm_models::settings::ModelSettings;
 
 use super::{BranchState, PolicyError, Surprise};
 use crate::engine::{self, EngineError, EngineSettings, Input, Output, Part};
+use crate::kernels::latents;
 
 /// What a branch computes in a tick.
 #[derive(Debug, Clone, Default)]
@@ -25,7 +27,7 @@ pub struct BranchBuffers {
 /// Everything between the parts of a tick.
 #[derive(Debug, Clone, Default)]
 pub struct Buffers {
-    /// Features of the shared encoder, `[2c, 16, 16]`.
+    /// Features of the shared encoder, `[2c, 16, 16]`; only where the parts run as exported.
     pub features: Vec<f32>,
     /// Robot branch.
     pub robot: BranchBuffers,
@@ -71,6 +73,18 @@ impl Buffers {
         Surprise { robot: self.robot.surprise(), environment: self.environment.surprise() }
     }
 
+    /// Whether both priors are fit to go on with.
+    pub(super) fn check_priors(&self) -> Result<(), PolicyError> {
+        self.robot.check_prior(PartName::Robot, self.classes)?;
+        self.environment.check_prior(PartName::Environment, self.classes)
+    }
+
+    /// Whether both posteriors are.
+    pub(super) fn check_posteriors(&self) -> Result<(), PolicyError> {
+        self.robot.check_posterior(PartName::Robot, self.classes)?;
+        self.environment.check_posterior(PartName::Environment, self.classes)
+    }
+
     /// The prior stands in for the posterior, as where there is no image.
     pub(super) fn believe_prior(&mut self) {
         for branch in [&mut self.robot, &mut self.environment] {
@@ -83,8 +97,7 @@ impl Buffers {
 impl BranchBuffers {
     /// `KL[q || p]` of the posterior against the prior, in nats, summed over the categoricals.
     fn surprise(&self) -> f32 {
-        let pairs = self.posterior_log_probs.iter().zip(&self.prior_log_probs);
-        pairs.map(|(q, p)| q.exp() * (q - p)).sum()
+        latents::divergence(Arch::new(), &self.posterior_log_probs, &self.prior_log_probs)
     }
 
     fn outputs(&mut self) -> [Output<'_>; 5] {
@@ -98,21 +111,31 @@ impl BranchBuffers {
     }
 
     fn check(&self, part: PartName, classes: usize) -> Result<(), PolicyError> {
+        self.check_prior(part, classes)?;
+        self.check_posterior(part, classes)
+    }
+
+    fn check_prior(&self, part: PartName, classes: usize) -> Result<(), PolicyError> {
         finite(part, "h_next", &self.h_next)?;
         finite(part, "prior_log_probs", &self.prior_log_probs)?;
+        exists(part, "prior_z", &self.prior_z, classes)
+    }
+
+    fn check_posterior(&self, part: PartName, classes: usize) -> Result<(), PolicyError> {
         finite(part, "posterior_log_probs", &self.posterior_log_probs)?;
-        // A class that does not exist would be an index out of bounds in the next part.
-        let exists = |z: &[i64]| z.iter().all(|class| (0..classes as i64).contains(class));
-        for (output, z) in [("prior_z", &self.prior_z), ("posterior_z", &self.posterior_z)] {
-            if !exists(z) {
-                return Err(PolicyError::NotFinite { part, output });
-            }
-        }
-        Ok(())
+        exists(part, "posterior_z", &self.posterior_z, classes)
     }
 }
 
-fn finite(part: PartName, output: &'static str, values: &[f32]) -> Result<(), PolicyError> {
+/// A class that does not exist would be an index out of bounds in the next part.
+fn exists(part: PartName, output: &'static str, z: &[i64], classes: usize) -> Result<(), PolicyError> {
+    if z.iter().all(|class| (0..classes as i64).contains(class)) {
+        return Ok(());
+    }
+    Err(PolicyError::NotFinite { part, output })
+}
+
+pub(super) fn finite(part: PartName, output: &'static str, values: &[f32]) -> Result<(), PolicyError> {
     // Summing |x| * 0 gives 0 for finite numbers and NaN otherwise, and compiles to vector instructions.
     if values.iter().map(|x| x * 0.0).sum::<f32>() == 0.0 {
         return Ok(());

@@ -8,6 +8,7 @@ use rcwm_models::bundle::{Bundle, PartName};
 use super::noise::NoiseSource;
 use super::parts::Parts;
 use super::stages::StageClock;
+use super::tick::Tick;
 use super::{Buffers, PolicyError, State};
 use crate::engine::{EngineError, EngineSettings};
 
@@ -20,46 +21,6 @@ pub(super) struct Sequential {
 impl Sequential {
     pub(super) fn load(bundle: &Bundle, settings: EngineSettings) -> Result<Self, EngineError> {
         Ok(Self { parts: Parts::load(bundle, settings)?, action: [0.0; ACTION_LEN] })
-    }
-
-    /// Remembers the action: all else waits for the image.
-    pub(super) fn work_ahead(
-        &mut self,
-        _: &State,
-        action: &[f32; ACTION_LEN],
-        _: &NoiseSource,
-        _: &mut Buffers,
-        _: &mut StageClock,
-    ) -> Result<(), PolicyError> {
-        self.action = *action;
-        Ok(())
-    }
-
-    pub(super) fn observe(
-        &mut self,
-        image: &[u8],
-        state: &State,
-        noise: &NoiseSource,
-        buffers: &mut Buffers,
-        clock: &mut StageClock,
-    ) -> Result<(), PolicyError> {
-        self.parts.run_encoder(image, buffers)?;
-        clock.ended(PartName::Encoder);
-        self.branches(state, noise, buffers, clock)?;
-        self.act(buffers, clock)
-    }
-
-    /// The branches run on the features of the last image; what they make of them is not used.
-    pub(super) fn imagine(
-        &mut self,
-        state: &State,
-        noise: &NoiseSource,
-        buffers: &mut Buffers,
-        clock: &mut StageClock,
-    ) -> Result<(), PolicyError> {
-        self.branches(state, noise, buffers, clock)?;
-        buffers.believe_prior();
-        self.act(buffers, clock)
     }
 
     fn branches(
@@ -82,5 +43,47 @@ impl Sequential {
         self.parts.run_actor(buffers)?;
         clock.ended(PartName::Actor);
         Ok(())
+    }
+}
+
+impl Tick for Sequential {
+    /// Remembers the action: all else waits for the image.
+    fn work_ahead(
+        &mut self,
+        _: &State,
+        action: &[f32; ACTION_LEN],
+        _: &NoiseSource,
+        _: &mut Buffers,
+        _: &mut StageClock,
+    ) -> Result<(), PolicyError> {
+        self.action = *action;
+        Ok(())
+    }
+
+    fn observe(
+        &mut self,
+        image: &[u8],
+        state: &State,
+        noise: &NoiseSource,
+        buffers: &mut Buffers,
+        clock: &mut StageClock,
+    ) -> Result<(), PolicyError> {
+        self.parts.run_encoder(image, buffers)?;
+        clock.ended(PartName::Encoder);
+        self.branches(state, noise, buffers, clock)?;
+        self.act(buffers, clock)
+    }
+
+    /// The branches run on the features of the last image; what they make of them is not used.
+    fn imagine(
+        &mut self,
+        state: &State,
+        noise: &NoiseSource,
+        buffers: &mut Buffers,
+        clock: &mut StageClock,
+    ) -> Result<(), PolicyError> {
+        self.branches(state, noise, buffers, clock)?;
+        buffers.believe_prior();
+        self.act(buffers, clock)
     }
 }

@@ -21,9 +21,19 @@ impl StageClock {
     /// The stage has ended now.
     pub(super) fn ended(&mut self, stage: PartName) {
         let now = Instant::now();
-        if let Some(index) = STAGES.iter().position(|name| *name == stage) {
-            self.spent_ns[index] += now.duration_since(self.last).as_nanos() as u64;
-        }
+        self.took(stage, now.duration_since(self.last).as_nanos() as u64);
         self.last = now;
+    }
+
+    /// The stage took this long, beside another.
+    pub(super) fn took(&mut self, stage: PartName, time_ns: u64) {
+        if let Some(index) = STAGES.iter().position(|name| *name == stage) {
+            self.spent_ns[index] += time_ns;
+        }
+    }
+
+    /// The next stage begins now.
+    pub(super) fn restart(&mut self) {
+        self.last = Instant::now();
     }
 }

@@ -1,0 +1,90 @@
+//! From the five exported ONNX files to what the tick runs.
+//!
+//! 1. [`join`]: the parts become one graph, the whole tick, as they hang together in time.
+//! 2. [`fuse`]: groups of nodes that are hot become one node of our own each, and layouts are changed where that saves copies.
+//! 3. [`segments`]: the graph is cut into pieces that run one after another: per part, what can be known before the image is there (*early*) and
+//!    what cannot (*late*).
+//!
+//! All of it is a rewriting of ONNX graphs: what runs is what the files say, and a group of nodes that is not recognised stays as it is, for
+//! tract to run. Names of values are `part/name`; those of the tick's own inputs are in [`inputs`].
+
+mod fuse;
+mod graph;
+mod join;
+mod pattern;
+mod segments;
+
+pub use graph::{Fact, Graph};
+pub use segments::Segment;
+
+use rcwm_models::bundle::{Bundle, PartName};
+
+/// Names of the tick's inputs.
+pub mod inputs {
+    /// The image; all that depends on it is late.
+    pub const IMAGE: &str = "image";
+    /// The executed action.
+    pub const ACTION: &str = "action";
+    /// Gumbel noise of the robot branch.
+    pub const ROBOT_NOISE: &str = "robot.noise";
+    /// Gumbel noise of the environment branch.
+    pub const ENVIRONMENT_NOISE: &str = "environment.noise";
+    /// Carried posterior z of the robot.
+    pub const ROBOT_Z: &str = "robot.z";
+    /// Carried h of the robot.
+    pub const ROBOT_H: &str = "robot.h";
+    /// Carried posterior z of the environment.
+    pub const ENVIRONMENT_Z: &str = "environment.z";
+    /// Carried h of the environment.
+    pub const ENVIRONMENT_H: &str = "environment.h";
+}
+
+/// What is done to the graph beside cutting it; each can be left out to see what it brings.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, serde::Serialize)]
+pub struct Optimizations {
+    /// LayerNorm and `SiLU` as one node.
+    pub norms: bool,
+    /// Convolution, norm and `SiLU` as one node, channels last, padding and byte conversion within.
+    pub convolutions: bool,
+    /// Products with packed weights, sums of table rows, biases, norm and `SiLU` as one node; softmax, uniform share and logarithm as
+    /// one node; noise and argmax as one node.
+    pub layers: bool,
+    /// Weights of layers kept in 16 bits; changes results a little, so it is not done by default.
+    pub half_weights: bool,
+}
+
+impl Optimizations {
+    /// All that keep the results as they are (up to rounding).
+    pub const EXACT: Self = Self { norms: true, convolutions: true, layers: true, half_weights: false };
+    /// None.
+    pub const NONE: Self = Self { norms: false, convolutions: false, layers: false, half_weights: false };
+}
+
+impl Default for Optimizations {
+    fn default() -> Self {
+        Self::EXACT
+    }
+}
+
+/// Why a bundle's parts could not be made into a tick.
+#[derive(Debug, thiserror::Error)]
+pub enum CompileError {
+    /// A part cannot be read.
+    #[error("{part}: {reason}")]
+    Part {
+        /// The part.
+        part: PartName,
+        /// What is wrong.
+        reason: String,
+    },
+}
+
+/// The segments of a bundle's tick, in the order they run.
+///
+/// # Errors
+/// [`CompileError::Part`].
+pub fn compile(bundle: &Bundle, optimizations: Optimizations) -> Result<Vec<Segment>, CompileError> {
+    let mut graph = join::join(bundle)?;
+    fuse::fuse(&mut graph, optimizations);
+    Ok(segments::cut(&graph))
+}

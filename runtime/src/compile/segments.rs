@@ -1,0 +1,63 @@
+//! The pieces of a tick that run one after another.
+
+use std::collections::{BTreeMap, BTreeSet};
+
+use rcwm_models::bundle::PartName;
+use rcwm_models::onnx::{self, ValueInfo};
+
+use super::graph::{Fact, Graph, TickNode};
+use super::join::to_bytes;
+
+/// A piece of the tick, as an ONNX file of its own.
+#[derive(Debug, Clone, PartialEq)]
+pub struct Segment {
+    /// The part it comes from.
+    pub part: PartName,
+    /// Whether it needs the image.
+    pub late: bool,
+    /// What goes in: the tick's inputs and other segments' outputs.
+    pub inputs: Vec<(String, Fact)>,
+    /// What comes out.
+    pub outputs: Vec<String>,
+    /// The file.
+    pub onnx: Vec<u8>,
+    /// Operators in it, for people who ask.
+    pub operators: Vec<String>,
+}
+
+/// Early segments, then late ones, each in the order of the parts.
+pub(super) fn cut(graph: &Graph) -> Vec<Segment> {
+    let places = [false, true].into_iter().flat_map(|late| PartName::REQUIRED.map(|part| (part, late)));
+    places.filter_map(|(part, late)| segment(graph, part, late)).collect()
+}
+
+fn segment(graph: &Graph, part: PartName, late: bool) -> Option<Segment> {
+    let mine = |node: &&TickNode| node.part == part && node.late == late;
+    let nodes: Vec<&TickNode> = graph.nodes.iter().filter(mine).collect();
+    if nodes.is_empty() {
+        return None;
+    }
+    let made: BTreeSet<&String> = nodes.iter().flat_map(|node| &node.node.output).collect();
+    let read: BTreeSet<&String> =
+        nodes.iter().flat_map(|node| &node.node.input).filter(|name| !name.is_empty()).collect();
+    let read_elsewhere: BTreeSet<&String> =
+        graph.nodes.iter().filter(|node| !mine(node)).flat_map(|node| &node.node.input).collect();
+    let inputs = read.iter().filter(|name| !made.contains(**name) && !graph.constants.contains_key(**name));
+    let inputs: Vec<(String, Fact)> =
+        inputs.filter_map(|name| Some(((*name).clone(), graph.facts.get(*name)?.clone()))).collect();
+    let wanted = |name: &&&String| read_elsewhere.contains(**name) || graph.outputs.contains(**name);
+    let outputs: Vec<String> = made.iter().filter(wanted).map(|name| (*name).clone()).collect();
+    let operators = nodes.iter().map(|node| node.node.op_type.clone()).collect();
+    let constants: BTreeMap<_, _> = graph.constants.iter().filter(|(name, _)| read.contains(name)).collect();
+    let value = |(name, fact): &(String, Fact)| ValueInfo::tensor(name, fact.dtype, &fact.shape);
+    let file = onnx::Graph {
+        name: format!("{part}.{}", if late { "late" } else { "early" }),
+        node: nodes.iter().map(|node| node.node.clone()).collect(),
+        initializer: constants.into_values().cloned().collect(),
+        input: inputs.iter().map(value).collect(),
+        output: outputs.iter().map(|name| ValueInfo { name: name.clone(), r#type: None }).collect(),
+        ..onnx::Graph::default()
+    };
+    let opset = graph.opsets.get(&part).copied().unwrap_or(17);
+    Some(Segment { part, late, inputs, outputs, onnx: to_bytes(file, opset), operators })
+}

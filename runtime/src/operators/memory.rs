@@ -1,0 +1,121 @@
+//! Results in memory that is used again, and pieces of it for two threads.
+
+use std::marker::PhantomData;
+use std::sync::Arc;
+
+use tract_onnx::tract_hir::internal::*;
+
+/// Tensors of one shape that results are written into, in turn.
+#[derive(Debug, Clone)]
+pub(super) struct Results {
+    dtype: DatumType,
+    shape: TVec<usize>,
+    tensors: Vec<Arc<Tensor>>,
+}
+
+impl Results {
+    pub(super) fn new(dtype: DatumType, shape: &[usize]) -> Self {
+        Self { dtype, shape: shape.into(), tensors: Vec::new() }
+    }
+
+    /// A tensor that nobody else reads, filled by `write`. Its old contents are what they were.
+    pub(super) fn write<T: Datum>(&mut self, write: impl FnOnce(&mut [T])) -> TractResult<TVec<TValue>> {
+        let free = self.tensors.iter_mut().position(|tensor| Arc::get_mut(tensor).is_some());
+        let index = match free {
+            Some(index) => index,
+            None => {
+                self.tensors.push(Arc::new(Tensor::zero_dt(self.dtype, &self.shape)?));
+                self.tensors.len() - 1
+            }
+        };
+        if let Some(tensor) = Arc::get_mut(&mut self.tensors[index]) {
+            write(tensor.try_as_plain_ram_mut()?.as_slice_mut::<T>()?);
+        }
+        Ok(tvec!(Arc::clone(&self.tensors[index]).into_tvalue()))
+    }
+}
+
+/// The contents of an input.
+pub(super) fn slice<T: Datum>(value: &TValue) -> TractResult<&[T]> {
+    value.try_as_plain_ram()?.as_slice::<T>()
+}
+
+/// Pieces of a slice, each handed out once.
+pub(super) struct Pieces<'a, T> {
+    start: *mut T,
+    len: usize,
+    piece: usize,
+    of: PhantomData<&'a mut [T]>,
+}
+
+// SAFETY: it is a mutable slice that is taken apart; see `take`.
+unsafe impl<T: Send> Sync for Pieces<'_, T> {}
+
+impl<'a, T> Pieces<'a, T> {
+    pub(super) fn new(slice: &'a mut [T], piece: usize) -> Self {
+        Self { start: slice.as_mut_ptr(), len: slice.len(), piece, of: PhantomData }
+    }
+
+    pub(super) fn count(&self) -> usize {
+        self.len.div_ceil(self.piece)
+    }
+
+    /// The piece of this index.
+    ///
+    /// # Safety
+    /// No index may be taken twice.
+    #[expect(clippy::mut_from_ref, reason = "pieces do not overlap, and each is taken once")]
+    pub(super) unsafe fn take(&self, index: usize) -> &'a mut [T] {
+        let first = index * self.piece;
+        assert!(first < self.len, "piece {index}");
+        // SAFETY: within the slice that was borrowed mutably for 'a; pieces of different indices do not overlap.
+        unsafe { std::slice::from_raw_parts_mut(self.start.add(first), self.piece.min(self.len - first)) }
+    }
+}
+
+/// What all our operators say about themselves: stateful, nothing folded, one stream.
+macro_rules! stateful_op {
+    ($op:ty, $state:ty, $name:expr) => {
+        impl PartialEq for $op {
+            fn eq(&self, other: &Self) -> bool {
+                std::sync::Arc::ptr_eq(&self.0, &other.0)
+            }
+        }
+
+        impl Eq for $op {}
+
+        impl tract_onnx::tract_core::ops::Op for $op {
+            fn name(&self) -> StaticName {
+                $name.into()
+            }
+
+            op_as_typed_op!();
+        }
+
+        impl EvalOp for $op {
+            not_out_of_plan!();
+
+            fn state(&self, _: &EvalContext<'_>) -> TractResult<Option<Box<dyn OpState>>> {
+                Ok(Some(Box::new(<$state>::new(self))))
+            }
+        }
+
+        impl OpState for $state {
+            fn eval(
+                &mut self,
+                _: &EvalContext<'_>,
+                op: &dyn Op,
+                inputs: TVec<TValue>,
+            ) -> TractResult<TVec<TValue>> {
+                let op = op.downcast_ref::<$op>().ok_or_else(|| format_err!("state of another operator"))?;
+                self.run(op, &inputs)
+            }
+
+            fn reset_lanes(&mut self, _: &[LaneId]) -> TractResult<()> {
+                Ok(())
+            }
+        }
+    };
+}
+
+pub(super) use stateful_op;

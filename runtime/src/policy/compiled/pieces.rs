@@ -1,0 +1,134 @@
+//! Segments loaded into tract, and the values that go between them without being copied.
+
+use std::collections::BTreeMap;
+use std::sync::Arc;
+
+use rcwm_models::bundle::PartName;
+use rcwm_models::onnx::data_type;
+use tract_onnx::prelude::*;
+
+use super::super::PolicyError;
+use crate::compile::{CompileError, Fact, Segment};
+use crate::operators::{self, SharedTeam};
+
+/// Values by name.
+#[derive(Default)]
+pub(super) struct Values {
+    places: BTreeMap<String, usize>,
+    tensors: Vec<Arc<Tensor>>,
+}
+
+impl Values {
+    /// The place of a value; a new one holds zeros.
+    fn place(&mut self, name: &str, fact: Option<&Fact>) -> TractResult<usize> {
+        if let Some(place) = self.places.get(name) {
+            return Ok(*place);
+        }
+        let tensor = match fact {
+            None => Tensor::zero::<f32>(&[0])?,
+            Some(fact) => match fact.dtype {
+                data_type::UINT8 => Tensor::zero::<u8>(&fact.shape)?,
+                data_type::INT64 => Tensor::zero::<i64>(&fact.shape)?,
+                _ => Tensor::zero::<f32>(&fact.shape)?,
+            },
+        };
+        self.tensors.push(Arc::new(tensor));
+        self.places.insert(name.to_owned(), self.tensors.len() - 1);
+        Ok(self.tensors.len() - 1)
+    }
+
+    /// Writes one of the tick's inputs; one that no segment reads is left out.
+    pub(super) fn fill<T: Datum + Copy>(&mut self, name: &str, from: &[T]) -> TractResult<()> {
+        let Some(place) = self.places.get(name) else { return Ok(()) };
+        // A clone happens only if a segment has kept it, which ours do not.
+        let tensor = Arc::make_mut(&mut self.tensors[*place]);
+        let mut view = tensor.try_as_plain_ram_mut()?;
+        let to = view.as_slice_mut::<T>()?;
+        if to.len() != from.len() {
+            anyhow::bail!("{name} has {} elements, expected {}", from.len(), to.len());
+        }
+        to.copy_from_slice(from);
+        Ok(())
+    }
+
+    /// Reads a value.
+    pub(super) fn copy<T: Datum + Copy>(&self, name: &str, to: &mut [T]) -> TractResult<()> {
+        let Some(place) = self.places.get(name) else { anyhow::bail!("nothing makes {name}") };
+        let view = self.tensors[*place].try_as_plain_ram()?;
+        let from = view.as_slice::<T>()?;
+        if to.len() != from.len() {
+            anyhow::bail!("{name} has {} elements, expected {}", from.len(), to.len());
+        }
+        to.copy_from_slice(from);
+        Ok(())
+    }
+
+    /// Makes one value stand for another.
+    pub(super) fn alias(&mut self, of: &str, name: &str) {
+        if let (Some(of), Some(place)) = (self.places.get(of), self.places.get(name)) {
+            self.tensors[*place] = Arc::clone(&self.tensors[*of]);
+        }
+    }
+}
+
+/// A segment in tract.
+pub(super) struct Piece {
+    pub(super) part: PartName,
+    inputs: Vec<usize>,
+    outputs: Vec<usize>,
+    state: TypedSimpleState,
+}
+
+impl Piece {
+    pub(super) fn load(
+        segment: &Segment,
+        values: &mut Values,
+        team: Option<&SharedTeam>,
+    ) -> Result<Self, PolicyError> {
+        Self::try_load(segment, values, team).map_err(|error| {
+            let reason = crate::engine::one_line(&format!("{error:#}"));
+            CompileError::Part { part: segment.part, reason }.into()
+        })
+    }
+
+    fn try_load(segment: &Segment, values: &mut Values, team: Option<&SharedTeam>) -> TractResult<Self> {
+        let mut model =
+            operators::onnx().model_for_read(&mut &segment.onnx[..])?.into_typed()?.into_decluttered()?;
+        operators::settle(&mut model, team);
+        let state = TypedSimpleState::new(&model.into_optimized()?.into_runnable()?)?;
+        let inputs = segment
+            .inputs
+            .iter()
+            .map(|(name, fact)| values.place(name, Some(fact)))
+            .collect::<TractResult<_>>()?;
+        let outputs =
+            segment.outputs.iter().map(|name| values.place(name, None)).collect::<TractResult<_>>()?;
+        Ok(Self { part: segment.part, inputs, outputs, state })
+    }
+
+    pub(super) fn makes(&self, values: &Values, name: &str) -> bool {
+        values.places.get(name).is_some_and(|place| self.outputs.contains(place))
+    }
+
+    /// What goes in.
+    pub(super) fn inputs(&self, values: &Values) -> TVec<TValue> {
+        self.inputs.iter().map(|place| Arc::clone(&values.tensors[*place]).into_tvalue()).collect()
+    }
+
+    pub(super) fn run_on(&mut self, inputs: TVec<TValue>) -> TractResult<TVec<TValue>> {
+        self.state.run(inputs)
+    }
+
+    /// Puts what came out where others find it.
+    pub(super) fn keep(&self, results: TVec<TValue>, values: &mut Values) {
+        for (place, result) in self.outputs.iter().zip(results) {
+            values.tensors[*place] = result.into_arc_tensor();
+        }
+    }
+
+    pub(super) fn run(&mut self, values: &mut Values) -> TractResult<()> {
+        let results = self.run_on(self.inputs(values))?;
+        self.keep(results, values);
+        Ok(())
+    }
+}
