@@ -1,5 +1,5 @@
-//! What the machine could do at best: convolutions at the rate of a large matrix product, all other weights at the speed memory
-//! is read, one after another on one core.
+//! What the machine could do at best between image and action: convolutions at the rate of a large matrix product, the weights of all
+//! else at the speed that as many bytes as a whole tick reads are read again and again, one after the other.
 
 use std::hint::black_box;
 use std::time::Instant;
@@ -16,8 +16,8 @@ use crate::inspect::Cost;
 
 /// Side of the matrices of the measured product: they fit into a core's second cache.
 const GEMM_SIDE: usize = 256;
-/// Bytes read to measure memory: larger than any last cache.
-const READ_BYTES: usize = 256 << 20;
+/// Least bytes read to measure memory: below it, the clock's steps show.
+const READ_BYTES_MIN: u64 = 1 << 20;
 /// Repetitions; the best one counts, for the limit is what the machine can do undisturbed.
 const REPETITIONS: usize = 12;
 
@@ -28,30 +28,37 @@ pub struct Machine {
     read_gb_per_s: f64,
 }
 
-/// Peaks of one core, and the shortest a tick can take with them.
+/// Peaks of one core, and the shortest time between image and action with them.
 #[derive(Debug, Clone, Copy, PartialEq, Serialize)]
 pub struct Limit {
     /// Rate of a large matrix product.
     pub gemm_gflops: f64,
-    /// Rate at which memory is read.
+    /// Rate at which as many bytes as a tick's weights are read.
     pub read_gb_per_s: f64,
-    /// Convolutions of a tick at that rate.
+    /// Floating-point operations of the convolutions that need the image.
+    pub convolution_flops: u64,
+    /// Bytes of the other weights that need the image.
+    pub weight_bytes: u64,
+    /// Convolutions at that rate.
     pub convolution_us: f64,
-    /// Weights of a tick at that rate.
+    /// Weights at that rate.
     pub weights_us: f64,
-    /// Sum of the two.
+    /// Sum of the two: one thread.
     pub tick_us: f64,
 }
 
 impl Machine {
-    /// The limit of a tick.
+    /// The limit of what needs the image.
     #[must_use]
-    pub fn of(&self, tick: &Cost) -> Limit {
-        let convolution_us = tick.convolution_flops as f64 / (self.gemm_gflops * 1e3);
-        let weights_us = tick.weight_bytes as f64 / (self.read_gb_per_s * 1e3);
+    pub fn of(&self, late: &Cost) -> Limit {
+        let weight_bytes = late.weight_bytes - late.convolution_weight_bytes;
+        let convolution_us = late.convolution_flops as f64 / (self.gemm_gflops * 1e3);
+        let weights_us = weight_bytes as f64 / (self.read_gb_per_s * 1e3);
         Limit {
             gemm_gflops: self.gemm_gflops,
             read_gb_per_s: self.read_gb_per_s,
+            convolution_flops: late.convolution_flops,
+            weight_bytes,
             convolution_us,
             weights_us,
             tick_us: convolution_us + weights_us,
@@ -59,13 +66,13 @@ impl Machine {
     }
 }
 
-/// Measures the peaks of one core.
+/// Measures the peaks of one core, for ticks that read this many bytes of weights.
 ///
 /// # Errors
 /// [`BenchError::Machine`].
-pub fn measure_machine() -> Result<Machine, BenchError> {
+pub fn measure_machine(weight_bytes: u64) -> Result<Machine, BenchError> {
     let gemm_gflops = gemm_gflops().map_err(|error| BenchError::Machine(format!("{error:#}")))?;
-    Ok(Machine { gemm_gflops, read_gb_per_s: read_gb_per_s() })
+    Ok(Machine { gemm_gflops, read_gb_per_s: read_gb_per_s(weight_bytes.max(READ_BYTES_MIN)) })
 }
 
 /// The best rate of a square product with constant right-hand side, in tract: the kernel that convolutions run on.
@@ -104,13 +111,13 @@ fn product() -> Vec<u8> {
     Model { ir_version: 8, graph: Some(graph), opset_import, ..Model::default() }.encode_to_vec()
 }
 
-fn read_gb_per_s() -> f64 {
-    let words = vec![1_u64; READ_BYTES / 8];
+fn read_gb_per_s(bytes: u64) -> f64 {
+    let words = vec![1_u64; (bytes / 8) as usize];
     let mut best_s = f64::INFINITY;
-    for _ in 0..REPETITIONS {
+    for _ in 0..20 * REPETITIONS {
         let start = Instant::now();
         black_box(black_box(&words).iter().fold(0_u64, |sum, word| sum.wrapping_add(*word)));
         best_s = best_s.min(start.elapsed().as_secs_f64());
     }
-    READ_BYTES as f64 / best_s / 1e9
+    (words.len() * 8) as f64 / best_s / 1e9
 }

@@ -6,7 +6,6 @@ use std::sync::atomic::Ordering;
 use clap::Args;
 
 use super::EngineChoice;
-use crate::engine::{EngineKind, EngineSettings};
 
 /// Arguments of `bench`.
 #[derive(Debug, Args)]
@@ -17,12 +16,15 @@ pub(super) struct BenchArguments {
     /// The bundle's folder
     #[arg(long, value_name = "DIR")]
     bundle: PathBuf,
-    /// Engine; ONNX Runtime runs with one and with two threads
+    /// Engine; tract runs as deployed and on one thread, ONNX Runtime the exported parts with one and with two threads
     #[arg(long, value_enum, default_value = "all")]
     engine: EngineChoice,
     /// Measured ticks of each engine
     #[arg(long, value_name = "N", default_value_t = 2000, value_parser = clap::value_parser!(u64).range(1..=100_000_000))]
     ticks: u64,
+    /// Measures tract from the exported parts to what is deployed, one optimisation at a time, in place of the engines
+    #[arg(long)]
+    ladder: bool,
     /// Writes everything to this file as JSON
     #[arg(long, value_name = "FILE")]
     json: Option<PathBuf>,
@@ -31,18 +33,15 @@ pub(super) struct BenchArguments {
 pub(super) fn run(arguments: &BenchArguments) -> anyhow::Result<()> {
     let bundle = super::open_bundle(&arguments.bundle)?;
     let (kinds, left_out) = arguments.engine.engines()?;
-    let mut engines = Vec::new();
-    for kind in kinds {
-        match kind {
-            EngineKind::Tract => engines.push(EngineSettings::tract()),
-            EngineKind::Ort => engines.extend([EngineSettings::ort(1), EngineSettings::ort(2)]),
-        }
+    let mut cases = crate::bench::engines(&kinds);
+    if arguments.ladder {
+        cases = crate::bench::ladder();
     }
     let stop = super::stop_flag()?;
     let ticks = arguments.ticks as usize;
     let bar = super::progress_bar(ticks + ticks / 10, "measuring");
     let mut rounds: u64 = 0;
-    let report = crate::bench::bench(&bundle, &engines, ticks, &mut || {
+    let report = crate::bench::bench(&bundle, &cases, ticks, &mut || {
         rounds += 1;
         // Drawing costs time that would disturb the next tick.
         if rounds.is_multiple_of(50) {
@@ -51,7 +50,7 @@ pub(super) fn run(arguments: &BenchArguments) -> anyhow::Result<()> {
         !stop.load(Ordering::Relaxed)
     })?;
     bar.finish_and_clear();
-    print!("{}", report.text());
+    print!("{}", if arguments.ladder { report.steps_text() } else { report.text() });
     if let Some(reason) = left_out {
         println!("engine ort not measured: {reason}");
     }

@@ -144,6 +144,8 @@ fn mark_late(graph: &mut Graph) {
 /// A model of one graph, as a file.
 pub(super) fn to_bytes(graph: onnx::Graph, opset: i64) -> Vec<u8> {
     let set = |domain: &str, version| onnx::OperatorSet { domain: domain.into(), version };
-    let opset_import = vec![set("", opset), set(DOMAIN, 1)];
+    let ours = graph.node.iter().any(|node| node.domain == DOMAIN);
+    let mut opset_import = vec![set("", opset)];
+    opset_import.extend(ours.then(|| set(DOMAIN, 1)));
     Model { ir_version: 8, graph: Some(graph), opset_import, ..Model::default() }.encode_to_vec()
 }

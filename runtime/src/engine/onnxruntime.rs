@@ -85,6 +85,8 @@ fn open_session(environment: &Environment, bytes: &[u8], threads: usize) -> ort:
         .with_intra_threads(threads)?
         .with_inter_threads(1)?
         .with_log_level(ort::logging::LogLevel::Error)?
+        // Its threads spin while a part runs, but do not take a core from others afterwards.
+        .with_config_entry("session.force_spinning_stop", "1")?
         .commit_from_memory(bytes)
 }
 

@@ -32,6 +32,8 @@ pub struct Cost {
     pub flops: u64,
     /// Bytes of weights read.
     pub weight_bytes: u64,
+    /// Those of them that are convolutions'.
+    pub convolution_weight_bytes: u64,
     /// How often each operator appears.
     pub operators: BTreeMap<String, u64>,
 }
@@ -59,7 +61,7 @@ impl Cost {
         if node.op_type.starts_with("Conv") {
             self.convolution_flops += flops;
         }
-        self.weight_bytes += if node.op_type == "Gather" {
+        let weight_bytes = if node.op_type == "Gather" {
             // Only the rows that are picked.
             match node.input.first().and_then(|name| weights.0.get(name)) {
                 Some(weight) if weight.float => elements(shapes, node.output.first()) * 4,
@@ -68,6 +70,10 @@ impl Cost {
         } else {
             node.input.iter().filter_map(|name| weights.0.get(name)).map(Weight::bytes).sum()
         };
+        self.weight_bytes += weight_bytes;
+        if node.op_type.starts_with("Conv") {
+            self.convolution_weight_bytes += weight_bytes;
+        }
     }
 
     /// The sum of two costs.
@@ -77,6 +83,7 @@ impl Cost {
         self.convolution_flops += other.convolution_flops;
         self.flops += other.flops;
         self.weight_bytes += other.weight_bytes;
+        self.convolution_weight_bytes += other.convolution_weight_bytes;
         for (operator, count) in &other.operators {
             *self.operators.entry(operator.clone()).or_default() += count;
         }

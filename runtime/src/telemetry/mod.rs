@@ -31,11 +31,13 @@ pub enum Stage {
     Tick,
     /// Observation published -> action published.
     EndToEnd,
+    /// What was worked ahead of the image, after the last action was sent.
+    Ahead,
 }
 
 impl Stage {
     /// All stages, in the order of a tick.
-    pub const ALL: [Self; 8] = [
+    pub const ALL: [Self; 9] = [
         Self::Receive,
         Self::Encoder,
         Self::Robot,
@@ -44,6 +46,7 @@ impl Stage {
         Self::Actor,
         Self::Tick,
         Self::EndToEnd,
+        Self::Ahead,
     ];
 
     /// The stages of the policy, in the order of [`STAGES`].
@@ -62,6 +65,7 @@ impl Stage {
             Self::Actor => "actor",
             Self::Tick => "tick",
             Self::EndToEnd => "end_to_end",
+            Self::Ahead => "ahead",
         }
     }
 }

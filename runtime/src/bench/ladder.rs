@@ -1,0 +1,71 @@
+//! What is measured beside one another.
+
+use serde::Serialize;
+
+use crate::compile::Optimizations;
+use crate::engine::{EngineKind, EngineSettings, Form};
+
+/// A way to run the tick.
+#[derive(Debug, Clone, Copy, PartialEq, Serialize)]
+pub struct Case {
+    /// In tables.
+    pub name: &'static str,
+    /// How.
+    #[serde(flatten)]
+    pub settings: EngineSettings,
+}
+
+/// ONNX Runtime as the yardstick: the five exported parts one after another, one thread.
+pub(super) const YARDSTICK: EngineSettings = EngineSettings::ort(1);
+/// The compiled tick on one thread.
+pub(super) const SINGLE: EngineSettings = EngineSettings::single_threaded(EngineKind::Tract);
+
+/// The engines as they are deployed: tract on one and on two threads, ONNX Runtime on one and on two.
+#[must_use]
+pub fn engines(kinds: &[EngineKind]) -> Vec<Case> {
+    let case = |name, settings| Case { name, settings };
+    let mut cases = Vec::new();
+    for kind in kinds {
+        match kind {
+            EngineKind::Tract => {
+                cases.push(case("tract", SINGLE));
+                if EngineSettings::tract().threads > 1 {
+                    cases.push(case("tract, 2 threads", EngineSettings::tract()));
+                }
+            }
+            EngineKind::Ort => {
+                cases.push(case("ort", YARDSTICK));
+                cases.push(case("ort, 2 threads", EngineSettings::ort(2)));
+            }
+        }
+    }
+    cases
+}
+
+/// tract from the exported parts to what is deployed, one step at a time, each with all before it.
+#[must_use]
+pub fn ladder() -> Vec<Case> {
+    let none = Optimizations::NONE;
+    let norms = Optimizations { norms: true, ..none };
+    let convolutions = Optimizations { convolutions: true, ..norms };
+    let layers = Optimizations { layers: true, ..convolutions };
+    let half = Optimizations { half_weights: true, ..layers };
+    let compiled =
+        |name, optimizations| Case { name, settings: SINGLE.with_form(Form::Compiled(optimizations)) };
+    let mut cases = vec![
+        Case { name: "exported parts", settings: SINGLE.with_form(Form::Exported) },
+        compiled("cut, worked ahead", none),
+        compiled("+ norms fused", norms),
+        compiled("+ convolutions", convolutions),
+        compiled("+ layers", layers),
+        compiled("+ f16 weights", half),
+    ];
+    if EngineSettings::tract().threads > 1 {
+        let two = |name, optimizations| {
+            let settings = EngineSettings::tract().with_form(Form::Compiled(optimizations));
+            Case { name, settings }
+        };
+        cases.extend([two("2 threads", layers), two("2 threads, f16 weights", half)]);
+    }
+    cases
+}

@@ -1,0 +1,146 @@
+//! What was measured, for people and for machines.
+
+use rcwm_models::bundle::Bundle;
+use serde::Serialize;
+
+use super::ladder::{SINGLE, YARDSTICK};
+use super::{Case, Limit};
+use crate::engine::EngineSettings;
+use crate::telemetry::{Latency, Stage, Telemetry, table};
+
+/// Latencies of one case.
+#[derive(Debug, Clone, PartialEq, Serialize)]
+pub struct CaseBench {
+    /// What was run.
+    #[serde(flatten)]
+    pub case: Case,
+    /// The limit by arithmetic over the median: of one thread, or of two that share everything evenly.
+    pub share_of_limit: f64,
+    /// Percentiles per stage; `tick` is image in, action out.
+    pub latency: Vec<Latency>,
+}
+
+/// One row of the table of steps.
+#[derive(Debug, Clone, PartialEq, Serialize)]
+pub struct Step {
+    /// What was run.
+    pub name: &'static str,
+    /// Median between image and action.
+    pub p50_us: f64,
+    /// Share of the limit.
+    pub share_of_limit: f64,
+}
+
+/// A bench run.
+#[derive(Debug, Clone, PartialEq, Serialize)]
+pub struct BenchReport {
+    /// Preset of the bundle.
+    pub preset: String,
+    /// Ticks of each case.
+    pub ticks: usize,
+    /// Median of tract as deployed over that of ONNX Runtime, which runs the five exported parts one after another with one thread;
+    /// absent unless both ran.
+    pub ratio_p50_vs_ort: Option<f64>,
+    /// The same of tract with one thread.
+    pub ratio_p50_vs_ort_single_thread: Option<f64>,
+    /// The limit by arithmetic over the median of tract as deployed; absent unless tract ran.
+    pub share_of_limit: Option<f64>,
+    /// The same of tract with one thread.
+    pub share_of_limit_single_thread: Option<f64>,
+    /// Three-nines over median of tract as deployed.
+    pub p999_over_p50: Option<f64>,
+    /// The limit of one thread.
+    pub limit: Limit,
+    /// Every case.
+    pub engines: Vec<CaseBench>,
+}
+
+impl BenchReport {
+    pub(super) fn new(bundle: &Bundle, ticks: usize, limit: Limit, runs: &[(Case, &Telemetry)]) -> Self {
+        let engines: Vec<CaseBench> = runs
+            .iter()
+            .map(|(case, telemetry)| CaseBench {
+                case: *case,
+                share_of_limit: share(&limit, case.settings, telemetry.latency(Stage::Tick).p50_us),
+                latency: telemetry.latencies(),
+            })
+            .collect();
+        let find = |settings: EngineSettings| engines.iter().find(|bench| bench.case.settings == settings);
+        let (deployed, single, yardstick) = (find(EngineSettings::tract()), find(SINGLE), find(YARDSTICK));
+        let ratio = |bench: Option<&CaseBench>| Some(bench?.tick()?.p50_us / yardstick?.tick()?.p50_us);
+        Self {
+            preset: bundle.manifest.provenance.preset.clone(),
+            ticks,
+            ratio_p50_vs_ort: ratio(deployed),
+            ratio_p50_vs_ort_single_thread: ratio(single),
+            share_of_limit: deployed.map(|bench| bench.share_of_limit),
+            share_of_limit_single_thread: single.map(|bench| bench.share_of_limit),
+            p999_over_p50: deployed.and_then(CaseBench::tick).map(|tick| tick.p999_us / tick.p50_us),
+            limit,
+            engines,
+        }
+    }
+
+    /// The report for people.
+    #[must_use]
+    pub fn text(&self) -> String {
+        let Limit { gemm_gflops, read_gb_per_s, convolution_us, weights_us, tick_us, .. } = self.limit;
+        let mut text = format!(
+            "bench      {} bundle, {} ticks each, interleaved\n\
+             machine    {gemm_gflops:.1} GFLOP/s in matrix products, {read_gb_per_s:.1} GB/s of weights, one core each\n\
+             limit      {tick_us:.1} us from image to action on one thread: convolutions {convolution_us:.1}, other weights \
+             {weights_us:.1}\n",
+            self.preset, self.ticks
+        );
+        for bench in &self.engines {
+            let threads = bench.case.settings.threads;
+            text += &format!("{:<10} {threads} thread(s)\n", bench.case.name);
+            text += &table(&bench.latency);
+        }
+        for (name, value) in [
+            ("ratio_p50_vs_ort", self.ratio_p50_vs_ort),
+            ("ratio_p50_vs_ort_single_thread", self.ratio_p50_vs_ort_single_thread),
+            ("share_of_limit", self.share_of_limit),
+            ("share_of_limit_single_thread", self.share_of_limit_single_thread),
+            ("p999_over_p50", self.p999_over_p50),
+        ] {
+            if let Some(value) = value {
+                text += &format!("{name} {value:.3}\n");
+            }
+        }
+        text
+    }
+
+    /// The steps of a ladder.
+    #[must_use]
+    pub fn steps(&self) -> Vec<Step> {
+        let step = |bench: &CaseBench| {
+            let p50_us = bench.tick()?.p50_us;
+            Some(Step { name: bench.case.name, p50_us, share_of_limit: bench.share_of_limit })
+        };
+        self.engines.iter().filter_map(step).collect()
+    }
+
+    /// The steps for people, as a Markdown table.
+    #[must_use]
+    pub fn steps_text(&self) -> String {
+        let mut text = format!(
+            "| {} bundle, {} ticks | image to action, p50 us | share of the limit ({:.0} us on one thread) |\n| --- | --- | --- |\n",
+            self.preset, self.ticks, self.limit.tick_us
+        );
+        for Step { name, p50_us, share_of_limit } in self.steps() {
+            text += &format!("| {name} | {p50_us:.1} | {:.0} % |\n", 100.0 * share_of_limit);
+        }
+        text
+    }
+}
+
+impl CaseBench {
+    fn tick(&self) -> Option<&Latency> {
+        self.latency.iter().find(|latency| latency.stage == Stage::Tick)
+    }
+}
+
+fn share(limit: &Limit, settings: EngineSettings, p50_us: f64) -> f64 {
+    limit.tick_us / settings.threads as f64 / p50_us
+}
