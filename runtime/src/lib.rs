@@ -8,7 +8,9 @@
 //! | [`team`] | a second thread for the tick |
 //! | [`kernels`] | convolution, products, norms and latents for vector registers |
 //! | [`policy`] | one tick: image and executed action in, action distribution out; carries z and h of both branches |
-//! | [`controller`] | the loop over shared memory: order of observations, fallback, action limits, counters |
+//! | [`controller`] | the loop over shared memory: state machine, fallback, action limits, counters |
+//! | [`pacing`] | when the next observation is due, how to wait for it, when it counts as late |
+//! | [`realtime`] | what Linux grants a thread that must be on time |
 //! | [`telemetry`] | latency histograms, one per stage |
 //! | [`record`] | films, strips and episodes of what the policy saw, written beside the loop |
 //! | [`verify`] | a bundle against its golden values |
@@ -41,7 +43,9 @@ pub mod engine;
 pub mod inspect;
 pub mod kernels;
 pub mod operators;
+pub mod pacing;
 pub mod policy;
+pub mod realtime;
 pub mod record;
 pub mod team;
 pub mod telemetry;

@@ -7,10 +7,10 @@ use std::time::Duration;
 use anyhow::Context;
 use clap::Args;
 use rcwm_models::bundle::Bundle;
-use rcwm_models::wire::LinkSettings;
 
+use super::safety::{SafetyArguments, TimeArguments};
 use super::status::StatusLine;
-use crate::controller::{Controller, ControllerSettings, Ended, Fallback, TickObserver};
+use crate::controller::{Controller, ControllerError, ControllerSettings, Ended, TickObserver};
 use crate::engine::{EngineKind, EngineSettings};
 use crate::policy::{Policy, Sampling};
 use crate::record::{Recorded, Recorder};
@@ -20,8 +20,13 @@ use crate::record::{Recorded, Recorder};
 #[command(after_help = "Examples:\n  \
     rcwm-simulator serve --task reach --instance demo --episodes 3 &\n  \
     rcwm-runtime run --bundle models/bundles/debug --instance demo --record runs/demo\n\n\
+    rcwm-runtime run --bundle DIR --instance arm --realtime --cpu 3 --fallback zero --rate-limit 0.2 \\\n    \
+    --surprise-robot-max 20\n\n\
     Ends when the simulator says that it closes, after --episodes, or on Ctrl-C. A simulator that dies is waited for:\n\
-    the run goes on with the next one on the instance.")]
+    the run goes on with the next one on the instance. docs/controller.md draws what happens when.\n\n\
+    Exit codes:\n  \
+    0 done (also after Ctrl-C), 1 error, 2 usage, 3 no observation within --timeout, 4 stopped: the policy was unfit\n  \
+    for --fallback-ticks-max ticks, 5 the peer was silent for --silence-max, 130 second Ctrl-C")]
 pub(super) struct RunArguments {
     /// The bundle's folder
     #[arg(long, value_name = "DIR")]
@@ -42,7 +47,7 @@ pub(super) struct RunArguments {
     #[arg(long)]
     stay: bool,
     /// Longest wait for the first observation, in seconds; 0 waits for ever
-    #[arg(long, value_name = "SECONDS", default_value_t = 60.0, value_parser = seconds)]
+    #[arg(long, value_name = "SECONDS", default_value_t = 60.0, value_parser = super::seconds)]
     timeout: f64,
     /// Samples latents and actions instead of taking the most probable
     #[arg(long)]
@@ -50,12 +55,6 @@ pub(super) struct RunArguments {
     /// Seed of --sample
     #[arg(long, value_name = "SEED", default_value_t = 0)]
     seed: u64,
-    /// What is sent when the policy has nothing fit to send
-    #[arg(long, value_enum, default_value = "hold")]
-    fallback: Fallback,
-    /// How long a wait polls before it blocks, in microseconds
-    #[arg(long, value_name = "US", default_value_t = 50)]
-    spin_us: u64,
     /// Records films, strips and episodes into this folder
     #[arg(long, value_name = "DIR")]
     record: Option<PathBuf>,
@@ -65,13 +64,10 @@ pub(super) struct RunArguments {
     /// Writes the summary to this file as JSON
     #[arg(long, value_name = "FILE")]
     json: Option<PathBuf>,
-}
-
-fn seconds(text: &str) -> Result<f64, String> {
-    match text.parse::<f64>() {
-        Ok(value) if (0.0..=1e6).contains(&value) => Ok(value),
-        _ => Err("expected seconds, 0 to 1000000".into()),
-    }
+    #[command(flatten)]
+    safety: SafetyArguments,
+    #[command(flatten)]
+    time: TimeArguments,
 }
 
 pub(super) fn run(arguments: &RunArguments) -> anyhow::Result<()> {
@@ -85,8 +81,14 @@ pub(super) fn run(arguments: &RunArguments) -> anyhow::Result<()> {
     let policy = Policy::new(&bundle, engine, sampling)?;
     let mut recorder = start_recorder(arguments, &bundle, engine)?;
     let mut controller = Controller::open(policy, arguments.controller_settings())?;
-    let result = control(&mut controller, arguments, recorder.as_mut(), &stop);
-    let mut report = controller.report(arguments.engine, *result.as_ref().unwrap_or(&Ended::Failed));
+    let mut status = StatusLine::start(&arguments.instance).context("starting the status line")?;
+    // Asked for last: the other threads stay ordinary ones.
+    let granted = arguments.time.ask()?;
+    let result = control(&mut controller, &mut status, recorder.as_mut(), &stop);
+    drop(status);
+    let ended = result.as_ref().map_or_else(Ended::from, |ended| *ended);
+    let mut report = controller.report(arguments.engine, ended);
+    report.realtime = granted;
     // The simulator is told before anything slow is done.
     let closed = controller.close();
     report.frames_dropped = recorder.as_ref().map_or(0, Recorder::dropped);
@@ -102,29 +104,26 @@ pub(super) fn run(arguments: &RunArguments) -> anyhow::Result<()> {
 
 impl RunArguments {
     fn controller_settings(&self) -> ControllerSettings {
-        let spin = Duration::from_micros(self.spin_us);
         ControllerSettings {
-            link: LinkSettings { spin, ..LinkSettings::new(&self.instance) },
             episodes_max: self.episodes,
             stay: self.stay,
             first_timeout: (self.timeout > 0.0).then(|| Duration::from_secs_f64(self.timeout)),
-            fallback: self.fallback,
+            ..self.safety.settings(&self.instance, &self.time)
         }
     }
 }
 
 fn control(
     controller: &mut Controller,
-    arguments: &RunArguments,
+    status: &mut StatusLine,
     recorder: Option<&mut Recorder>,
     stop: &AtomicBool,
-) -> anyhow::Result<Ended> {
-    let mut status = StatusLine::start(&arguments.instance).context("starting the status line")?;
-    let mut observers: Vec<&mut dyn TickObserver> = vec![&mut status];
+) -> Result<Ended, ControllerError> {
+    let mut observers: Vec<&mut dyn TickObserver> = vec![status];
     if let Some(recorder) = recorder {
         observers.push(recorder);
     }
-    Ok(controller.run(stop, &mut observers)?)
+    controller.run(stop, &mut observers)
 }
 
 fn start_recorder(
