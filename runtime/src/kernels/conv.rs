@@ -106,23 +106,35 @@ impl Conv {
         (self.side + 2) * self.channels_in
     }
 
-    /// Puts `x` [side, side, channels] into the middle of `padded`, whose border is and stays as it was (zeros), through `convert`.
+    /// Puts `x` [side, side, channels] into the middle of `padded`, whose border is and stays as it was (zeros).
     ///
     /// # Panics
     /// If the lengths do not fit: a programming error.
-    pub fn pad<T: Copy>(&self, arch: Arch, x: &[T], padded: &mut [f32], convert: impl Fn(T) -> f32 + Copy) {
+    pub fn pad(&self, x: &[f32], padded: &mut [f32]) {
+        for (from, to) in self.rows_of(x, padded) {
+            to.copy_from_slice(from);
+        }
+    }
+
+    /// Puts bytes there, as `x / divisor + shift`.
+    ///
+    /// # Panics
+    /// As [`Self::pad`].
+    pub fn pad_bytes(&self, arch: Arch, x: &[u8], (divisor, shift): (f32, f32), padded: &mut [f32]) {
+        arch.dispatch(PadBytes { conv: self, x, divisor, shift, padded });
+    }
+
+    /// Rows of `x` with their places in `padded`.
+    #[inline(always)]
+    fn rows_of<'a, T>(
+        &self,
+        x: &'a [T],
+        padded: &'a mut [f32],
+    ) -> impl Iterator<Item = (&'a [T], &'a mut [f32])> {
         assert_eq!((x.len(), padded.len()), (self.len_in(), self.len_padded()), "conv: lengths");
-        let (row, row_padded) = (self.side * self.channels_in, self.row_padded());
-        arch.dispatch(
-            #[inline(always)]
-            || {
-                for (from, to) in x.chunks_exact(row).zip(padded[row_padded..].chunks_exact_mut(row_padded)) {
-                    for (from, to) in from.iter().zip(&mut to[self.channels_in..][..row]) {
-                        *to = convert(*from);
-                    }
-                }
-            },
-        );
+        let (row, row_padded, border) = (self.side * self.channels_in, self.row_padded(), self.channels_in);
+        let places = padded[row_padded..].chunks_exact_mut(row_padded);
+        x.chunks_exact(row).zip(places).map(move |(from, to)| (from, &mut to[border..][..row]))
     }
 
     /// Computes these rows of the image that comes out into `out` [rows, `side_out`, `channels_out`]. Rows must begin and end at
@@ -144,6 +156,29 @@ impl Conv {
             #[cfg(target_arch = "x86_64")]
             (Arch::V4(simd), 8) => Arch::V3(*simd).dispatch(kernel),
             _ => arch.dispatch(kernel),
+        }
+    }
+}
+
+struct PadBytes<'a> {
+    conv: &'a Conv,
+    x: &'a [u8],
+    divisor: f32,
+    shift: f32,
+    padded: &'a mut [f32],
+}
+
+impl WithSimd for PadBytes<'_> {
+    type Output = ();
+
+    /// Plain loops: compiled for the instructions at hand, they become vectors by themselves.
+    #[inline(always)]
+    fn with_simd<S: Simd>(self, _: S) {
+        let Self { conv, x, divisor, shift, padded } = self;
+        for (from, to) in conv.rows_of(x, padded) {
+            for (from, to) in from.iter().zip(to) {
+                *to = f32::from(*from) / divisor + shift;
+            }
         }
     }
 }
@@ -308,7 +343,7 @@ mod tests {
             let conv = Conv::new(&weight, cin, cout, side);
             for arch in [Arch::new(), Arch::Scalar] {
                 let mut padded = vec![0.0; conv.len_padded()];
-                conv.pad(arch, &x, &mut padded, |x| x);
+                conv.pad(&x, &mut padded);
                 let mut out = vec![0.0; conv.len_out()];
                 let piece = 4 * (side / 2) * cout;
                 for (index, out) in out.chunks_exact_mut(piece).enumerate() {

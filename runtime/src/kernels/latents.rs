@@ -26,24 +26,48 @@ impl WithSimd for LogProbs<'_> {
     #[inline(always)]
     fn with_simd<S: Simd>(self, simd: S) {
         let Self { x, classes, factor, offset } = self;
+        let offset = simd.splat_f32s(offset);
         for row in x.chunks_exact_mut(classes) {
-            // `max` of numbers forgets NaN, but the sum below does not.
-            let largest = row.iter().copied().fold(f32::NEG_INFINITY, f32::max);
+            let largest = simd.splat_f32s(largest(simd, row));
             let sum = exponentials(simd, row, largest);
-            let factor = factor / sum;
-            each(simd, row, |simd, x| {
-                ln(simd, simd.mul_add_f32s(x, simd.splat_f32s(factor), simd.splat_f32s(offset)))
-            });
+            let factor = simd.splat_f32s(factor / sum);
+            // Closures would not be compiled for vectors unless they are taken in here.
+            each(
+                simd,
+                row,
+                #[inline(always)]
+                |simd, x| ln(simd, simd.mul_add_f32s(x, factor, offset)),
+            );
         }
     }
 }
 
+/// The largest number; forgets NaN, which the sum of exponentials does not.
+#[inline(always)]
+fn largest<S: Simd>(simd: S, row: &[f32]) -> f32 {
+    let (whole, rest) = S::as_simd_f32s(row);
+    let mut lanes = simd.splat_f32s(f32::NEG_INFINITY);
+    for x in whole {
+        // The second operand wins where one is NaN.
+        lanes = simd.max_f32s(*x, lanes);
+    }
+    rest.iter().copied().fold(simd.reduce_max_f32s(lanes), f32::max)
+}
+
 /// `x` becomes `e^(x - largest)`; gives the sum.
 #[inline(always)]
-fn exponentials<S: Simd>(simd: S, row: &mut [f32], largest: f32) -> f32 {
-    each(simd, row, |simd, x| exp(simd, simd.sub_f32s(x, simd.splat_f32s(largest))));
+fn exponentials<S: Simd>(simd: S, row: &mut [f32], largest: S::f32s) -> f32 {
+    each(
+        simd,
+        row,
+        #[inline(always)]
+        |simd, x| exp(simd, simd.sub_f32s(x, largest)),
+    );
     let (whole, rest) = S::as_simd_f32s(row);
-    let sum = whole.iter().fold(simd.splat_f32s(0.0), |sum, x| simd.add_f32s(sum, *x));
+    let mut sum = simd.splat_f32s(0.0);
+    for x in whole {
+        sum = simd.add_f32s(sum, *x);
+    }
     simd.reduce_sum_f32s(sum) + rest.iter().sum::<f32>()
 }
 

@@ -74,12 +74,8 @@ impl ConvolutionState {
     fn run(&mut self, op: &ConvolutionOp, inputs: &[TValue]) -> TractResult<TVec<TValue>> {
         let (arch, Block { conv, norm, from_bytes, .. }) = (Arch::new(), &*op.0);
         match from_bytes {
-            Some((divisor, shift)) => {
-                conv.pad(arch, slice::<u8>(&inputs[0])?, &mut self.padded, |x| {
-                    f32::from(x) / divisor + shift
-                });
-            }
-            None => conv.pad(arch, slice::<f32>(&inputs[0])?, &mut self.padded, |x| x),
+            Some(change) => conv.pad_bytes(arch, slice::<u8>(&inputs[0])?, *change, &mut self.padded),
+            None => conv.pad(slice::<f32>(&inputs[0])?, &mut self.padded),
         }
         let (padded, side) = (self.padded.as_slice(), conv.side_out());
         self.results.write(|out: &mut [f32]| {
