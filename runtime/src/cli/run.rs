@@ -40,6 +40,9 @@ pub(super) struct RunArguments {
     /// Threads of a tick: of tract 1 or 2 (by default 2 where there are two cores), of ort those inside an operator
     #[arg(long, value_name = "N", value_parser = clap::value_parser!(u16).range(1..=64))]
     threads: Option<u16>,
+    /// Keeps the weights of layers in 16 bits: faster where memory is slow; `verify --half-weights` says what it changes (tract only)
+    #[arg(long)]
+    half_weights: bool,
     /// Ends after this many whole episodes
     #[arg(long, value_name = "N", value_parser = clap::value_parser!(u64).range(1..))]
     episodes: Option<u64>,
@@ -73,7 +76,8 @@ pub(super) struct RunArguments {
 pub(super) fn run(arguments: &RunArguments) -> anyhow::Result<()> {
     let stop = super::stop_flag()?;
     let bundle = super::open_bundle(&arguments.bundle)?;
-    let engine = EngineSettings::of(arguments.engine, arguments.threads);
+    let engine =
+        EngineSettings::of(arguments.engine, arguments.threads).with_half_weights(arguments.half_weights);
     let sampling = match arguments.sample {
         true => Sampling::Sample { seed: arguments.seed },
         false => Sampling::Mode,

@@ -6,7 +6,7 @@ use clap::Args;
 use serde::Serialize;
 
 use super::EngineChoice;
-use crate::verify::{EngineReport, verify, work_units};
+use crate::verify::{EngineReport, HalfReport, half_weights, verify, work_units};
 
 /// Arguments of `verify`.
 #[derive(Debug, Args)]
@@ -22,6 +22,9 @@ pub(super) struct VerifyArguments {
     /// Largest absolute error of a part's output
     #[arg(long, value_name = "ERROR", default_value = "1e-5")]
     tolerance: f32,
+    /// Also measures what 16-bit weights (run --half-weights) change
+    #[arg(long)]
+    half_weights: bool,
     /// Writes everything to this file as JSON
     #[arg(long, value_name = "FILE")]
     json: Option<PathBuf>,
@@ -33,6 +36,8 @@ struct Report<'a> {
     tolerance: f32,
     verified: bool,
     left_out: &'a Option<String>,
+    #[serde(skip_serializing_if = "Option::is_none")]
+    half_weights: Option<HalfReport>,
     engines: &'a [EngineReport],
 }
 
@@ -51,6 +56,10 @@ pub(super) fn run(arguments: &VerifyArguments) -> anyhow::Result<()> {
     if let Some(reason) = &left_out {
         println!("engine ort not checked: {reason}");
     }
+    let half_weights = arguments.half_weights.then(|| half_weights(&bundle)).transpose()?;
+    if let Some(half) = &half_weights {
+        print!("{}", half.text());
+    }
     let failures: Vec<String> = engines
         .iter()
         .flat_map(|engine| engine.failures.iter().map(move |failure| format!("{}: {failure}", engine.engine)))
@@ -60,6 +69,7 @@ pub(super) fn run(arguments: &VerifyArguments) -> anyhow::Result<()> {
         tolerance: arguments.tolerance,
         verified: failures.is_empty(),
         left_out: &left_out,
+        half_weights,
         engines: &engines,
     };
     super::write_json(arguments.json.as_ref(), &report)?;

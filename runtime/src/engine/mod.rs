@@ -101,6 +101,17 @@ impl EngineSettings {
         Self { threads, ..self }
     }
 
+    /// With the weights of layers kept in 16 bits, where the form is compiled.
+    #[must_use]
+    pub const fn with_half_weights(self, half_weights: bool) -> Self {
+        match self.form {
+            Form::Compiled(optimizations) => {
+                self.with_form(Form::Compiled(Optimizations { half_weights, ..optimizations }))
+            }
+            Form::Exported => self,
+        }
+    }
+
     /// With another form.
     #[must_use]
     pub const fn with_form(self, form: Form) -> Self {

@@ -30,18 +30,13 @@ impl Conv {
     /// Whether a convolution of these sizes is computed here; `side` is that of the square image that goes in.
     #[must_use]
     pub fn fits(channels_in: usize, channels_out: usize, side: usize) -> bool {
-        let width = Self::panel_width(channels_out, side / 2);
-        channels_in > 0
-            && side.is_power_of_two()
-            && side >= 2 * SIDE_OUT_MIN
-            && channels_out >= 8
-            && channels_out.is_multiple_of(width)
-            && matches!(width, 8 | 16 | 32)
+        channels_in > 0 && channels_out > 0 && side.is_power_of_two() && side >= 2 * SIDE_OUT_MIN
     }
 
     /// Few pixels and many weights: narrow panels let all pixels of a column be summed at once, so that each weight is read once.
     fn panel_width(channels_out: usize, side_out: usize) -> usize {
-        channels_out.min(if side_out == SIDE_OUT_MIN { 16 } else { 32 })
+        let widest = if side_out == SIDE_OUT_MIN { 16 } else { 32 };
+        channels_out.next_power_of_two().clamp(8, widest)
     }
 
     /// Lays out `weight` `[channels_out, channels_in, 4, 4]`.
@@ -58,6 +53,9 @@ impl Conv {
         let width = Self::panel_width(channels_out, side / 2);
         let at = |first: usize, row: usize, step: usize, lane: usize| {
             let (column, channel) = (step / channels_in, step % channels_in);
+            if first + lane >= channels_out {
+                return 0.0;
+            }
             weight[(((first + lane) * channels_in + channel) * KERNEL + row) * KERNEL + column]
         };
         let mut panels = Vec::with_capacity(weight.len());
@@ -220,6 +218,12 @@ impl Kernel<'_> {
         let panel_len = KERNEL * KERNEL * conv.channels_in * width;
         for (index, panel) in conv.panels.as_slice().chunks_exact(panel_len).enumerate() {
             for lane in (0..width).step_by(V * S::F32_LANES) {
+                // The last panel may be wider than what is left.
+                let Some(left) = conv.channels_out.checked_sub(index * width + lane).filter(|left| *left > 0)
+                else {
+                    break;
+                };
+                let lanes = left.min(V * S::F32_LANES);
                 for row in (0..rows.len()).step_by(R) {
                     for column in (0..side).step_by(C) {
                         let tile = Tile { conv, padded, panel, lane, row: rows.start + row, column };
@@ -228,14 +232,25 @@ impl Kernel<'_> {
                             for (c, sums) in sums.iter().enumerate() {
                                 let pixel = (row + r) * side + column + c;
                                 let place = pixel * conv.channels_out + index * width + lane;
-                                let place = &mut out[place..][..V * S::F32_LANES];
-                                S::as_mut_simd_f32s(place).0.copy_from_slice(sums);
+                                store(simd, sums, &mut out[place..][..lanes]);
                             }
                         }
                     }
                 }
             }
         }
+    }
+}
+
+/// Writes as many lanes as there is place for.
+#[inline(always)]
+fn store<S: Simd, const V: usize>(simd: S, sums: &[S::f32s; V], place: &mut [f32]) {
+    if place.len() == V * S::F32_LANES {
+        S::as_mut_simd_f32s(place).0.copy_from_slice(sums);
+        return;
+    }
+    for (sum, place) in sums.iter().zip(place.chunks_mut(S::F32_LANES)) {
+        simd.partial_store_f32s(place, *sum);
     }
 }
 
@@ -362,7 +377,7 @@ mod tests {
     #[test]
     fn sizes_that_do_not_fit_are_said_so() {
         assert!(Conv::fits(3, 32, 64) && Conv::fits(128, 128, 8));
-        for (cin, cout, side) in [(3, 4, 64), (3, 20, 64), (3, 8, 48), (3, 8, 4), (0, 8, 64), (3, 40, 64)] {
+        for (cin, cout, side) in [(3, 8, 48), (3, 8, 4), (0, 8, 64), (3, 0, 64)] {
             assert!(!Conv::fits(cin, cout, side), "{cin} {cout} {side}");
         }
     }

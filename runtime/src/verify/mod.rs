@@ -9,8 +9,11 @@
 //! ticks are still compared.
 
 mod golden;
+mod half;
 mod parts;
 mod recurrent;
+
+pub use half::{HALF_TICKS, HalfReport, half_weights};
 
 use std::path::PathBuf;
 

@@ -1,0 +1,112 @@
+//! The compiled tick against the exported parts.
+
+#![allow(clippy::unwrap_used, reason = "a test that fails panics")]
+
+mod support;
+
+use rcwm_models::bundle::{Bundle, PartName};
+use rcwm_runtime::compile::{Optimizations, compile};
+use rcwm_runtime::engine::{EngineKind, Form};
+use rcwm_runtime::policy::Sampling;
+use rcwm_runtime::{EngineSettings, Policy};
+use support::{image, smallest_bundle};
+
+fn policy(bundle: &Bundle, settings: EngineSettings) -> Policy {
+    Policy::new(bundle, settings, Sampling::Sample { seed: 3 }).unwrap()
+}
+
+fn with(optimizations: Optimizations) -> EngineSettings {
+    EngineSettings::single_threaded(EngineKind::Tract).with_form(Form::Compiled(optimizations))
+}
+
+#[test]
+fn nothing_that_is_hot_is_left_between_image_and_action() {
+    let bundle = Bundle::open(&smallest_bundle()).unwrap();
+    let segments = compile(&bundle, Optimizations::EXACT).unwrap();
+    let late: Vec<PartName> = segments.iter().filter(|s| s.late).map(|s| s.part).collect();
+    assert_eq!(late, [PartName::Encoder, PartName::Robot, PartName::Environment, PartName::Actor]);
+    let early: Vec<PartName> = segments.iter().filter(|s| !s.late).map(|s| s.part).collect();
+    assert_eq!(early, [PartName::Robot, PartName::Interaction, PartName::Environment, PartName::Actor]);
+    let hot = [
+        "Conv",
+        "MatMul",
+        "Gather",
+        "ReduceSum",
+        "LayerNormalization",
+        "Softmax",
+        "Log",
+        "ArgMax",
+        "Transpose",
+    ];
+    for segment in segments.iter().filter(|segment| segment.late) {
+        for operator in &segment.operators {
+            assert!(!hot.contains(&operator.as_str()), "{operator} in {}", segment.part);
+        }
+    }
+}
+
+#[test]
+fn every_optimization_gives_what_the_exported_parts_give() {
+    let bundle = Bundle::open(&smallest_bundle()).unwrap();
+    let none = Optimizations::NONE;
+    let norms = Optimizations { norms: true, ..none };
+    let convolutions = Optimizations { convolutions: true, ..norms };
+    let layers = Optimizations { layers: true, ..none };
+    let mut exported = policy(&bundle, with(none).with_form(Form::Exported));
+    let mut others =
+        [none, norms, convolutions, layers, Optimizations::EXACT].map(|o| policy(&bundle, with(o)));
+    for step in 0..40 {
+        let executed = [0.2, -0.5, (step as f32).sin(), 1.0];
+        let executed = (step % 20 > 0).then_some(&executed);
+        let expected = exported.observe(&image(step), executed).unwrap();
+        for (index, other) in others.iter_mut().enumerate() {
+            let found = other.observe(&image(step), executed).unwrap();
+            for (found, expected) in
+                found.mean.iter().chain(&found.std).zip(expected.mean.iter().chain(&expected.std))
+            {
+                assert!((found - expected).abs() < 1e-4, "{index}, step {step}: {found} {expected}");
+            }
+            assert_eq!(other.state().robot.z, exported.state().robot.z, "{index}, step {step}");
+            assert_eq!(other.state().environment.z, exported.state().environment.z, "{index}, step {step}");
+            other.set_state(exported.state()).unwrap();
+        }
+        let state = exported.state().clone();
+        exported.set_state(&state).unwrap();
+    }
+}
+
+#[test]
+fn one_thread_and_two_give_the_same_bits() {
+    let bundle = Bundle::open(&smallest_bundle()).unwrap();
+    let settings = with(Optimizations::EXACT);
+    let (mut one, mut two) = (policy(&bundle, settings), policy(&bundle, settings.with_threads(2)));
+    for step in 0..200 {
+        let executed = (step > 0).then_some(&[0.1; 4]);
+        let (one, two) = (one.observe(&image(step), executed), two.observe(&image(step), executed));
+        let (one, two) = (one.unwrap(), two.unwrap());
+        assert_eq!(one.action.map(f32::to_bits), two.action.map(f32::to_bits), "step {step}");
+        assert_eq!(one.surprise, two.surprise);
+    }
+}
+
+/// What was imagined goes on from the prior, whichever way the tick is computed.
+#[test]
+fn imagined_frames_agree_with_the_exported_parts() {
+    let bundle = Bundle::open(&smallest_bundle()).unwrap();
+    let settings = with(Optimizations::EXACT);
+    let mut exported = policy(&bundle, settings.with_form(Form::Exported));
+    let mut compiled = policy(&bundle, settings);
+    for step in 0..30 {
+        let executed = [0.3; 4];
+        let tick = |policy: &mut Policy| match step % 3 {
+            0 => policy.observe(&image(step), (step > 0).then_some(&executed)).unwrap(),
+            _ => policy.imagine(&executed).unwrap(),
+        };
+        let (expected, found) = (tick(&mut exported), tick(&mut compiled));
+        assert_eq!(expected.surprise.is_some(), step % 3 == 0);
+        for (found, expected) in found.mean.iter().zip(expected.mean) {
+            assert!((found - expected).abs() < 1e-4, "step {step}: {found} {expected}");
+        }
+        assert_eq!(compiled.state().robot.z, exported.state().robot.z, "step {step}");
+    }
+}
