@@ -45,7 +45,7 @@ impl WithSimd for Rows<'_> {
     fn with_simd<S: Simd>(self, simd: S) {
         let width = self.norm.gain.len();
         match width / S::F32_LANES {
-            _ if width % S::F32_LANES != 0 => {
+            _ if !width.is_multiple_of(S::F32_LANES) => {
                 self.x.chunks_exact_mut(width).for_each(|row| plain(self.norm, row))
             }
             1 => self.short::<S, 1>(simd),

@@ -64,7 +64,6 @@ impl<'a, T> Pieces<'a, T> {
     ///
     /// # Safety
     /// No index may be taken twice.
-    #[expect(clippy::mut_from_ref, reason = "pieces do not overlap, and each is taken once")]
     pub(super) unsafe fn take(&self, index: usize) -> &'a mut [T] {
         let first = index * self.piece;
         assert!(first < self.len, "piece {index}");
