@@ -13,8 +13,8 @@ use super::{CONV, SharedTeam};
 use crate::kernels::conv::Conv;
 use crate::kernels::norm::Norm;
 
-/// Work below this is not worth sharing: handing it over costs about a microsecond.
-const SHARED_FLOPS_MIN: usize = 500_000;
+/// Work below this is not worth sharing: the pixels would have to go from one core to the other and back.
+const SHARED_FLOPS_MIN: usize = 2_000_000;
 /// Rows of pixels that are handed over at a time.
 const ROWS: usize = 4;
 
