@@ -52,12 +52,28 @@ impl Controller {
         }
     }
 
+    /// Answers the last observation as before. One that is marked as repeated says that the peer still stands there, whatever was
+    /// imagined since: our answer was lost, or overwritten by one to a tick that the peer has not reached.
     fn answer_again(&mut self, observation: &Observation) -> Result<Taken, ControllerError> {
-        if let Some(answer) = self.answer
-            && answer.answers == observation.sequence
-        {
-            self.link.send(answer)?;
-            self.counters.answers += 1;
+        let sequence = observation.sequence;
+        let Some(own) = self.own_answer.filter(|own| own.answers == sequence) else {
+            return Ok(Taken::Again);
+        };
+        let went_on = self.answer.is_some_and(|answer| answer.answers != sequence);
+        if went_on && !observation.is(ObservationFlags::REPEATED) {
+            return Ok(Taken::Nothing);
+        }
+        if went_on {
+            self.rewind(sequence.saturating_add(1), false);
+        }
+        let source = ActionSource::from_wire(own.source).unwrap_or(ActionSource::Fallback);
+        if source == ActionSource::Policy {
+            self.state = step(self.state, Event::Decided, self.settings.ticks).0;
+        }
+        self.pacing.observed(observation);
+        let answer = self.send(sequence, source, own.action)?;
+        if went_on {
+            self.work_ahead((!observation.is(ObservationFlags::LAST)).then_some(&answer.action));
         }
         Ok(Taken::Again)
     }
@@ -89,6 +105,7 @@ impl Controller {
                 action,
             },
         };
+        self.own_answer = (!overtaken).then_some(answer);
         let times = TickTimes {
             scheduled_ns: observation.scheduled_ns,
             published_ns: observation.published_ns,

@@ -106,6 +106,8 @@ pub struct Controller {
     pace: Option<Pace>,
     /// The last answer, in this episode.
     answer: Option<Action>,
+    /// The answer to the last observation.
+    own_answer: Option<Action>,
     /// The policy's state before each imagined tick since the last observation, with the tick's sequence.
     imagined: Vec<(u64, policy::State)>,
     /// A newer observation that was found while the last was worked on.
@@ -154,6 +156,7 @@ impl Controller {
             whole_episodes: 0,
             pace: None,
             answer: None,
+            own_answer: None,
             imagined: Vec::with_capacity(settings.ticks.imagined_ticks_max.min(64) as usize),
             newer: None,
             looked: false,
