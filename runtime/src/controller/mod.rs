@@ -20,6 +20,7 @@ mod report;
 mod sequence;
 mod surprise;
 mod tick;
+mod times;
 
 pub use ended::{ControllerError, Ended};
 pub use gate::{Fallback, Gate, Passed};

@@ -167,7 +167,9 @@ impl Peer {
             }
             _ => self.publish(&observation)?,
         }
-        if let Some((_, late)) = self.delayed.pop_front_if(|(when, _)| *when <= self.sequence) {
+        if self.delayed.front().is_some_and(|(when, _)| *when <= self.sequence)
+            && let Some((_, late)) = self.delayed.pop_front()
+        {
             std::thread::sleep(Duration::from_nanos(self.period_ns / 4));
             self.publish(&late)?;
         }
