@@ -7,7 +7,7 @@ mod support;
 use assert_cmd::Command;
 use rcwm_models::files::sha256_hex;
 use rcwm_models::tensors::{Tensors, Values};
-use support::{own_link, smallest_bundle, with_manifest};
+use support::{observation, own_link, smallest_bundle, with_manifest};
 
 fn runtime() -> Command {
     Command::cargo_bin("rcwm-runtime").unwrap()
@@ -103,6 +103,59 @@ fn a_run_that_nobody_talks_to_ends_with_its_own_exit_code() {
     command.args(["run", "--instance", "silent", "--timeout", "0.3", "--bundle"]).arg(smallest_bundle());
     let error = error_of(&mut command, 3);
     assert!(error.contains("rcwm-simulator serve --instance silent"), "{error}");
+}
+
+#[test]
+fn a_peer_that_falls_silent_ends_the_run_with_its_own_exit_code_and_what_was_granted_is_in_the_json() {
+    let link = own_link();
+    let peer = link.peer();
+    peer.publish(|slot| *slot = observation(0, 0)).unwrap();
+    let json = tempfile::NamedTempFile::new().unwrap();
+    let mut command = runtime();
+    command.env("RCWM_PREFIX", link.prefix());
+    command.args([
+        "run",
+        "--instance",
+        "test",
+        "--silence-max",
+        "0.3",
+        "--cpu",
+        "0",
+        "--realtime",
+        "--bundle",
+    ]);
+    command.arg(smallest_bundle()).arg("--json").arg(json.path());
+    let answering = std::thread::spawn(move || error_of(&mut command, 5));
+    // The controller says hello: it missed the first one.
+    while !peer.poll_events().unwrap().hello {
+        std::thread::sleep(std::time::Duration::from_millis(5));
+    }
+    peer.publish(|slot| *slot = observation(0, 0)).unwrap();
+    let error = answering.join().unwrap();
+    assert!(error.contains("has been silent for 0.3 s"), "{error}");
+    let report: serde_json::Value = serde_json::from_slice(&std::fs::read(json.path()).unwrap()).unwrap();
+    assert_eq!(report["ended"], "peer_lost");
+    let grants = report["realtime"]["grants"].as_array().unwrap();
+    assert_eq!(grants.len(), 3);
+    for grant in grants {
+        assert!(grant["granted"].is_boolean() && !grant["detail"].as_str().unwrap().is_empty(), "{grant}");
+    }
+}
+
+#[test]
+fn a_core_that_does_not_exist_is_said_and_ends_the_run_only_where_it_is_required() {
+    let link = own_link();
+    for (required, code) in [(false, 3), (true, 1)] {
+        let mut command = runtime();
+        command.env("RCWM_PREFIX", link.prefix());
+        command.args(["run", "--instance", "test", "--timeout", "0.2", "--cpu", "1023", "--bundle"]);
+        command.arg(smallest_bundle());
+        if required {
+            command.arg("--realtime=require");
+        }
+        let error = error_of(&mut command, code);
+        assert_eq!(error.contains("core 1023: refused"), required, "{error}");
+    }
 }
 
 #[test]

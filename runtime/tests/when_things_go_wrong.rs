@@ -8,7 +8,7 @@ use std::time::Duration;
 
 use rcwm_models::bundle::PartName;
 use rcwm_models::wire::clock::monotonic_ns;
-use rcwm_models::wire::{Action, ActionSource, Observation, SimulatorLink, Wait};
+use rcwm_models::wire::{Action, ActionSource, Observation, ObservationFlags, SimulatorLink, Wait};
 use rcwm_runtime::controller::{Cause, ControllerError, Ended, Fallback, State, SurpriseLimits, TickLimits};
 use rcwm_runtime::{EngineSettings, Policy};
 use support::{ask, dividing_by_zero, image, observation, own_link, smallest_bundle, start_controller_with};
@@ -99,6 +99,31 @@ fn an_observation_that_comes_after_it_was_imagined_is_answered_as_if_it_had_been
     peer.close().unwrap();
     let counters = controller.join().unwrap().1.counters;
     assert!(counters.late_observations >= 2 && counters.stale_observations == 0, "{counters:?}");
+}
+
+#[test]
+fn a_peer_that_has_lost_the_answer_gets_it_again_whatever_was_imagined_since() {
+    let link = own_link();
+    let peer = link.peer();
+    let ticks = TickLimits { imagined_ticks_max: 2, fallback_ticks_max: 1 };
+    let controller = start_controller_with(&smallest_bundle(), &link, |settings| settings.ticks = ticks);
+    let mut policy = Policy::load(&smallest_bundle(), EngineSettings::tract()).unwrap();
+    let first = ask(&peer, &due_now(0));
+    assert_eq!(first.action, policy.observe(&image(0), None).unwrap().action);
+    next(&peer, "fallback", is(ActionSource::Fallback));
+    // The same twice in the link is no reason to go back, the peer that says so is.
+    peer.publish(|slot| *slot = due_now(0)).unwrap();
+    let mut again = due_now(0);
+    again.flags |= ObservationFlags::REPEATED.0;
+    let answer = ask(&peer, &again);
+    assert_eq!((answer.action, answer.source), (first.action, ActionSource::Policy as u32));
+    let sent = due_now(1);
+    peer.publish(|slot| *slot = sent).unwrap();
+    let answer =
+        next(&peer, "policy's answer", |action| action.answers == 1 && is(ActionSource::Policy)(action));
+    assert_eq!(answer.action, policy.observe(&image(1), Some(&sent.executed_action)).unwrap().action);
+    peer.close().unwrap();
+    controller.join().unwrap().0.unwrap();
 }
 
 #[test]

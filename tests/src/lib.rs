@@ -3,6 +3,8 @@
 //!
 //! The binaries are those beside the test's own in the target folder; `make test` builds them first.
 
+pub mod faults;
+
 use std::io::Read;
 use std::path::{Path, PathBuf};
 use std::process::{Child, Command, ExitStatus, Output, Stdio};
@@ -37,8 +39,11 @@ pub fn shipped_bundle() -> PathBuf {
 #[must_use]
 pub fn binary(name: &str) -> PathBuf {
     let own = std::env::current_exe().expect("a test has a path");
-    // target/release/deps/test-1234 -> target/release
-    let folder = own.parent().and_then(Path::parent).expect("tests lie in target/<profile>/deps");
+    // target/release/deps/test-1234 or target/release/fault-table -> target/release
+    let mut folder = own.parent().expect("a program lies in a folder");
+    if folder.ends_with("deps") {
+        folder = folder.parent().expect("tests lie in target/<profile>/deps");
+    }
     let path = folder.join(name);
     assert!(
         path.is_file(),

@@ -5,15 +5,11 @@ use rcwm_models::wire::clock::monotonic_ns;
 use rcwm_models::wire::{Action, ActionSource, Observation, ObservationFlags, ObservationSample};
 
 use super::{
-    Arrival, Cause, Controller, ControllerError, EpisodeResult, Event, Pace, Response, State, Taken, Tick,
+    Arrival, Cause, Controller, ControllerError, EpisodeResult, Event, Response, State, Taken, Tick,
     TickObserver, TickTimes, step,
 };
-use crate::pacing::Missing;
 use crate::policy::{Decision, PolicyError};
 use crate::telemetry::Stage;
-
-/// Ticks without an answer that are told one by one in the latency from the schedule.
-const UNANSWERED_TOLD_MAX: u64 = 1000;
 
 /// A tick on its way to the observers.
 struct Ticked<'a> {
@@ -52,12 +48,28 @@ impl Controller {
         }
     }
 
+    /// Answers the last observation as before. One that is marked as repeated says that the peer still stands there, whatever was
+    /// imagined since: our answer was lost, or overwritten by one to a tick that the peer has not reached.
     fn answer_again(&mut self, observation: &Observation) -> Result<Taken, ControllerError> {
-        if let Some(answer) = self.answer
-            && answer.answers == observation.sequence
-        {
-            self.link.send(answer)?;
-            self.counters.answers += 1;
+        let sequence = observation.sequence;
+        let Some(own) = self.own_answer.filter(|own| own.answers == sequence) else {
+            return Ok(Taken::Again);
+        };
+        let went_on = self.answer.is_some_and(|answer| answer.answers != sequence);
+        if went_on && !observation.is(ObservationFlags::REPEATED) {
+            return Ok(Taken::Nothing);
+        }
+        if went_on {
+            self.rewind(sequence.saturating_add(1), false);
+        }
+        let source = ActionSource::from_wire(own.source).unwrap_or(ActionSource::Fallback);
+        if source == ActionSource::Policy {
+            self.state = step(self.state, Event::Decided, self.settings.ticks).0;
+        }
+        self.pacing.observed(observation);
+        let answer = self.send(sequence, source, own.action)?;
+        if went_on {
+            self.work_ahead((!observation.is(ObservationFlags::LAST)).then_some(&answer.action));
         }
         Ok(Taken::Again)
     }
@@ -89,6 +101,7 @@ impl Controller {
                 action,
             },
         };
+        self.own_answer = (!overtaken).then_some(answer);
         let times = TickTimes {
             scheduled_ns: observation.scheduled_ns,
             published_ns: observation.published_ns,
@@ -108,16 +121,6 @@ impl Controller {
             self.work_ahead((!observation.is(ObservationFlags::LAST)).then_some(&answer.action));
         }
         Ok(Taken::New)
-    }
-
-    /// Ticks before this one, of this publisher, that were not answered in any way (real time).
-    fn unanswered(&self, observation: &Observation, is_first: bool) -> u64 {
-        match self.answer {
-            Some(answer) if !is_first && observation.period_ns > 0 => {
-                observation.sequence.saturating_sub(answer.answers.saturating_add(1))
-            }
-            _ => 0,
-        }
     }
 
     /// Goes back to before a tick was imagined whose observation came after all.
@@ -301,46 +304,6 @@ impl Controller {
         // See above: the tick tells.
         let _ = self.policy.work_ahead(action);
         self.telemetry.record(Stage::Ahead, monotonic_ns() - start_ns);
-    }
-
-    fn record_stages(&mut self, decision: &Decision) {
-        for (stage, time_ns) in Stage::POLICY.into_iter().zip(decision.stage_ns) {
-            self.telemetry.record(stage, time_ns);
-        }
-    }
-
-    fn record_times(&mut self, observation: &Observation, times: &TickTimes, unanswered: u64) {
-        let TickTimes { scheduled_ns, published_ns, received_ns, .. } = *times;
-        let period_ns = observation.period_ns;
-        self.pace = Some(Pace::of(period_ns));
-        // An answer that was overtaken is late by all the time until now.
-        let ended_ns = if times.sent_ns == 0 { monotonic_ns() } else { times.sent_ns };
-        let telemetry = &mut self.telemetry;
-        telemetry.record(Stage::Receive, received_ns.saturating_sub(published_ns));
-        telemetry.record(Stage::Tick, ended_ns.saturating_sub(received_ns));
-        telemetry.record(Stage::EndToEnd, ended_ns.saturating_sub(published_ns));
-        // One that was sent again for us is older than we are.
-        if period_ns == 0 || observation.is(ObservationFlags::REPEATED) {
-            return;
-        }
-        telemetry.record(Stage::PublishLag, published_ns.saturating_sub(scheduled_ns));
-        let from_schedule_ns = ended_ns.saturating_sub(scheduled_ns);
-        for ticks in 0..=unanswered.min(UNANSWERED_TOLD_MAX) {
-            let waited_ns = from_schedule_ns.saturating_add(period_ns.saturating_mul(ticks));
-            telemetry.record(Stage::FromSchedule, waited_ns);
-        }
-        let counters = &mut self.counters;
-        counters.published_late += u64::from(published_ns > scheduled_ns.saturating_add(period_ns));
-        let missed = times.sent_ns == 0 || from_schedule_ns > period_ns;
-        let ours_in_time = times.sent_ns > 0 && ended_ns.saturating_sub(published_ns) <= period_ns;
-        counters.missed_deadlines += u64::from(missed) + unanswered;
-        counters.missed_deadlines_published_late += u64::from(missed && ours_in_time);
-    }
-
-    fn record_missing(&mut self, missing: &Missing, times: &TickTimes) {
-        self.telemetry.record(Stage::Imagine, times.sent_ns.saturating_sub(times.received_ns));
-        self.telemetry.record(Stage::FromSchedule, times.sent_ns.saturating_sub(times.scheduled_ns));
-        self.counters.skipped_ticks += missing.skipped;
     }
 
     fn show(&self, ticked: &Ticked<'_>, observers: &mut [&mut dyn TickObserver]) {

@@ -13,28 +13,30 @@
 //! image corrects it.
 
 mod answering;
+mod ended;
 mod gate;
 mod machine;
 mod report;
 mod sequence;
 mod surprise;
+mod tick;
+mod times;
 
+pub use ended::{ControllerError, Ended};
 pub use gate::{Fallback, Gate, Passed};
 pub use machine::{Cause, Event, Response, State, TickLimits, step};
 pub use report::{Counters, EpisodeResult, Pace, RunReport};
 pub use sequence::{Arrival, SequenceTracker};
 pub use surprise::{BranchSurprise, SurpriseLimits, SurpriseReport};
+pub use tick::{Tick, TickObserver, TickTimes};
 
 use std::sync::atomic::{AtomicBool, Ordering};
 use std::time::{Duration, Instant};
 
-use rcwm_models::wire::{
-    Action, ControllerLink, LinkError, LinkSettings, Observation, ObservationSample, Wait,
-    clock::monotonic_ns,
-};
+use rcwm_models::wire::{Action, ControllerLink, LinkSettings, ObservationSample, Wait, clock::monotonic_ns};
 
 use crate::pacing::{Pacing, PacingSettings, Plan};
-use crate::policy::{self, Decision, Policy};
+use crate::policy::{self, Policy};
 use crate::telemetry::Telemetry;
 use surprise::SurpriseTelemetry;
 
@@ -87,124 +89,6 @@ impl ControllerSettings {
     }
 }
 
-/// Why the loop could not go on.
-#[derive(Debug, thiserror::Error)]
-pub enum ControllerError {
-    /// The link failed.
-    #[error(transparent)]
-    Link(#[from] LinkError),
-    /// Nobody published an observation.
-    #[error(
-        "no observation came on instance {instance:?} in {timeout_s} s; start `rcwm-simulator serve --instance {instance}` \
-         (same user, same RCWM_PREFIX), or wait longer with --timeout"
-    )]
-    NoObservation {
-        /// The instance.
-        instance: String,
-        /// How long was waited, in s.
-        timeout_s: f64,
-    },
-    /// The peer was there and has been silent for too long.
-    #[error(
-        "the peer on instance {instance:?} has been silent for {silence_s} s; look after it, or wait longer with \
-         --silence-max"
-    )]
-    PeerLost {
-        /// The instance.
-        instance: String,
-        /// The limit, in s.
-        silence_s: f64,
-    },
-    /// The fallback was sent for as long as allowed.
-    #[error(
-        "stopped after {ticks} fallback actions in a row: {cause}; look at the counts of the summary, check the bundle with \
-         `rcwm-runtime verify`, or allow more with --fallback-ticks-max"
-    )]
-    Stopped {
-        /// Why the policy was unfit.
-        cause: Cause,
-        /// The limit.
-        ticks: u32,
-    },
-}
-
-/// Why the loop ended.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, serde::Serialize)]
-#[serde(rename_all = "snake_case")]
-pub enum Ended {
-    /// The simulator said that it closes.
-    SimulatorClosed,
-    /// The number of episodes that was asked for is reached.
-    Episodes,
-    /// The user asked for it.
-    Interrupted,
-    /// The peer was silent for too long.
-    PeerLost,
-    /// The policy was unfit for too long.
-    Stopped,
-    /// Another error ended it.
-    Failed,
-}
-
-impl From<&ControllerError> for Ended {
-    fn from(error: &ControllerError) -> Self {
-        match error {
-            ControllerError::PeerLost { .. } => Self::PeerLost,
-            ControllerError::Stopped { .. } => Self::Stopped,
-            ControllerError::Link(_) | ControllerError::NoObservation { .. } => Self::Failed,
-        }
-    }
-}
-
-/// When things happened in one tick, CLOCK_MONOTONIC in ns.
-#[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub struct TickTimes {
-    /// When the observation was due; in lock-step when it was published.
-    pub scheduled_ns: u64,
-    /// When it was published; 0 where none came.
-    pub published_ns: u64,
-    /// When it was received, or found overdue.
-    pub received_ns: u64,
-    /// When the answer was published; 0 where it was not, see [`Tick::overtaken`].
-    pub sent_ns: u64,
-}
-
-/// What happened in one tick; shown to observers after the action was sent.
-pub struct Tick<'a> {
-    /// The observation, in shared memory; none where it was missing.
-    pub observation: Option<&'a Observation>,
-    /// Whether the policy's state started anew.
-    pub is_first: bool,
-    /// The state went back to before this tick was imagined, because its observation came after all.
-    pub rewound: bool,
-    /// What the policy decided, on the observation or on an imagined frame; none where it was unfit or not asked.
-    pub decision: Option<Decision>,
-    /// What was sent.
-    pub answer: Action,
-    /// Not sent: a newer observation had come before the answer to this one was ready.
-    pub overtaken: bool,
-    /// What the controller is up to after the tick.
-    pub state: State,
-    /// Times of the tick.
-    pub times: TickTimes,
-    /// The policy after the tick; its state is that of the last good tick where the answer is a fallback.
-    pub policy: &'a Policy,
-    /// All so far.
-    pub telemetry: &'a Telemetry,
-    /// All so far.
-    pub counters: &'a Counters,
-    /// Whole and cut episodes so far.
-    pub episodes: &'a [EpisodeResult],
-    /// The running episode, this observation included.
-    pub running: EpisodeResult,
-}
-
-/// Looks on: recorders, status lines. Runs in the loop's thread after the action was sent, so it must be quick.
-pub trait TickObserver {
-    /// After every tick.
-    fn ticked(&mut self, tick: &Tick<'_>);
-}
-
 /// A policy on a link.
 pub struct Controller {
     policy: Policy,
@@ -223,16 +107,21 @@ pub struct Controller {
     pace: Option<Pace>,
     /// The last answer, in this episode.
     answer: Option<Action>,
+    /// The answer to the last observation.
+    own_answer: Option<Action>,
     /// The policy's state before each imagined tick since the last observation, with the tick's sequence.
     imagined: Vec<(u64, policy::State)>,
     /// A newer observation that was found while the last was worked on.
     newer: Option<ObservationSample>,
+    /// An overdue tick was given its last chance.
+    looked: bool,
 }
 
 /// What the link has brought.
 enum Brought {
     Observation(ObservationSample),
     Nothing,
+    Overdue,
     Closed,
 }
 
@@ -268,8 +157,10 @@ impl Controller {
             whole_episodes: 0,
             pace: None,
             answer: None,
+            own_answer: None,
             imagined: Vec::with_capacity(settings.ticks.imagined_ticks_max.min(64) as usize),
             newer: None,
+            looked: false,
             policy,
             settings,
         })
@@ -293,22 +184,24 @@ impl Controller {
             let taken = match self.bring(stop)? {
                 Brought::Observation(sample) => self.take(&sample, observers)?,
                 Brought::Nothing => Taken::Nothing,
+                Brought::Overdue => {
+                    self.looked = false;
+                    self.go_without(observers)?;
+                    Taken::Nothing
+                }
                 Brought::Closed if !self.settings.stay => return Ok(Ended::SimulatorClosed),
                 Brought::Closed => {
                     self.leave();
                     Taken::Nothing
                 }
             };
-            // Observations of no use, however many, do not keep an overdue tick from its turn.
-            if taken != Taken::New && self.pacing.plan(monotonic_ns()) == Plan::Overdue {
-                self.go_without(observers)?;
-            }
             if taken == Taken::Nothing {
                 self.bear_silence(heard)?;
                 self.ask_again(heard, &mut asked)?;
             } else {
                 heard = Instant::now();
             }
+            self.looked &= taken != Taken::New;
             if self.settings.episodes_max.is_some_and(|max| self.whole_episodes >= max) {
                 return Ok(Ended::Episodes);
             }
@@ -321,14 +214,21 @@ impl Controller {
             return Ok(Brought::Observation(sample));
         }
         let wait = match self.pacing.plan(monotonic_ns()) {
-            Plan::Overdue => match self.link.poll_observation()? {
-                Some(sample) => Ok(Wait::Message(sample)),
-                None => Ok(Wait::TimedOut),
-            },
-            Plan::Wait { spin, timeout } => self.link.wait_observation_polling(spin, timeout.min(WAIT_SLICE)),
+            // What has come while the time ran out wins, but is looked at once: observations of no use, however many, do not keep
+            // an overdue tick from its turn.
+            Plan::Overdue if self.looked => Ok(Wait::TimedOut),
+            Plan::Overdue => {
+                self.looked = true;
+                Ok(self.link.poll_observation()?.map_or(Wait::TimedOut, Wait::Message))
+            }
+            Plan::Wait { spin, timeout } => {
+                self.looked = false;
+                self.link.wait_observation_polling(spin, timeout.min(WAIT_SLICE))
+            }
         };
         match wait {
             Ok(Wait::Message(sample)) => Ok(Brought::Observation(sample)),
+            Ok(Wait::TimedOut) if self.looked => Ok(Brought::Overdue),
             Ok(Wait::TimedOut) => Ok(Brought::Nothing),
             Ok(Wait::Closed) => Ok(Brought::Closed),
             // A signal interrupts waiting; it has set `stop`.

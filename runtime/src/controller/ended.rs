@@ -1,0 +1,74 @@
+//! How a run ends.
+
+use rcwm_models::wire::LinkError;
+
+use super::Cause;
+
+/// Why the loop could not go on.
+#[derive(Debug, thiserror::Error)]
+pub enum ControllerError {
+    /// The link failed.
+    #[error(transparent)]
+    Link(#[from] LinkError),
+    /// Nobody published an observation.
+    #[error(
+        "no observation came on instance {instance:?} in {timeout_s} s; start `rcwm-simulator serve --instance {instance}` \
+         (same user, same RCWM_PREFIX), or wait longer with --timeout"
+    )]
+    NoObservation {
+        /// The instance.
+        instance: String,
+        /// How long was waited, in s.
+        timeout_s: f64,
+    },
+    /// The peer was there and has been silent for too long.
+    #[error(
+        "the peer on instance {instance:?} has been silent for {silence_s} s; look after it, or wait longer with \
+         --silence-max"
+    )]
+    PeerLost {
+        /// The instance.
+        instance: String,
+        /// The limit, in s.
+        silence_s: f64,
+    },
+    /// The fallback was sent for as long as allowed.
+    #[error(
+        "stopped after {ticks} fallback actions in a row: {cause}; look at the counts of the summary, check the bundle with \
+         `rcwm-runtime verify`, or allow more with --fallback-ticks-max"
+    )]
+    Stopped {
+        /// Why the policy was unfit.
+        cause: Cause,
+        /// The limit.
+        ticks: u32,
+    },
+}
+
+/// Why the loop ended.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, serde::Serialize)]
+#[serde(rename_all = "snake_case")]
+pub enum Ended {
+    /// The simulator said that it closes.
+    SimulatorClosed,
+    /// The number of episodes that was asked for is reached.
+    Episodes,
+    /// The user asked for it.
+    Interrupted,
+    /// The peer was silent for too long.
+    PeerLost,
+    /// The policy was unfit for too long.
+    Stopped,
+    /// Another error ended it.
+    Failed,
+}
+
+impl From<&ControllerError> for Ended {
+    fn from(error: &ControllerError) -> Self {
+        match error {
+            ControllerError::PeerLost { .. } => Self::PeerLost,
+            ControllerError::Stopped { .. } => Self::Stopped,
+            ControllerError::Link(_) | ControllerError::NoObservation { .. } => Self::Failed,
+        }
+    }
+}
