@@ -7,6 +7,7 @@
 //! | [`controller`] | the loop over shared memory: order of observations, fallback, action limits, counters |
 //! | [`telemetry`] | latency histograms, one per stage |
 //! | [`record`] | films, strips and episodes of what the policy saw, written beside the loop |
+//! | [`mod@log`] | every tick of a run, replayed bit for bit or turned into episodes |
 //! | [`verify`] | a bundle against its golden values |
 //! | [`inspect`] | what a bundle holds and what a tick costs |
 //! | [`mod@bench`] | the tick's latency on this machine, engines interleaved |
@@ -34,6 +35,7 @@ pub mod cli;
 pub mod controller;
 pub mod engine;
 pub mod inspect;
+pub mod log;
 pub mod policy;
 pub mod record;
 pub mod telemetry;

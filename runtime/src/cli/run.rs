@@ -12,6 +12,7 @@ use rcwm_models::wire::LinkSettings;
 use super::status::StatusLine;
 use crate::controller::{Controller, ControllerSettings, Ended, Fallback, TickObserver};
 use crate::engine::{EngineKind, EngineSettings};
+use crate::log::{LogSettings, LogSummary, Logger};
 use crate::policy::{Policy, Sampling};
 use crate::record::{Recorded, Recorder};
 
@@ -62,6 +63,9 @@ pub(super) struct RunArguments {
     /// Records at most this many episodes
     #[arg(long, value_name = "N", default_value_t = 3)]
     record_episodes: u64,
+    /// Logs every tick to this file, for `rcwm-runtime replay`; it must not exist yet
+    #[arg(long, value_name = "FILE")]
+    log: Option<PathBuf>,
     /// Writes the summary to this file as JSON
     #[arg(long, value_name = "FILE")]
     json: Option<PathBuf>,
@@ -84,19 +88,22 @@ pub(super) fn run(arguments: &RunArguments) -> anyhow::Result<()> {
     };
     let policy = Policy::new(&bundle, engine, sampling)?;
     let mut recorder = start_recorder(arguments, &bundle, engine)?;
+    let mut logger = start_logger(arguments, &policy, engine, sampling)?;
     let mut controller = Controller::open(policy, arguments.controller_settings())?;
-    let result = control(&mut controller, arguments, recorder.as_mut(), &stop);
+    let result = control(&mut controller, arguments, recorder.as_mut(), logger.as_mut(), &stop);
     let mut report = controller.report(arguments.engine, *result.as_ref().unwrap_or(&Ended::Failed));
     // The simulator is told before anything slow is done.
     let closed = controller.close();
     report.frames_dropped = recorder.as_ref().map_or(0, Recorder::dropped);
     let recorded = finish_recorder(recorder);
+    let logged = logger.map(Logger::finish).transpose();
     if report.counters.observations > 0 || result.is_ok() {
         print!("{}", report.summary());
         super::write_json(arguments.json.as_ref(), &report)?;
     }
     result?;
     print!("{}", recorded_lines(&recorded?));
+    print!("{}", logged?.as_ref().map(logged_line).unwrap_or_default());
     Ok(closed?)
 }
 
@@ -117,12 +124,16 @@ fn control(
     controller: &mut Controller,
     arguments: &RunArguments,
     recorder: Option<&mut Recorder>,
+    logger: Option<&mut Logger>,
     stop: &AtomicBool,
 ) -> anyhow::Result<Ended> {
     let mut status = StatusLine::start(&arguments.instance).context("starting the status line")?;
     let mut observers: Vec<&mut dyn TickObserver> = vec![&mut status];
     if let Some(recorder) = recorder {
         observers.push(recorder);
+    }
+    if let Some(logger) = logger {
+        observers.push(logger);
     }
     Ok(controller.run(stop, &mut observers)?)
 }
@@ -134,6 +145,23 @@ fn start_recorder(
 ) -> anyhow::Result<Option<Recorder>> {
     let Some(folder) = &arguments.record else { return Ok(None) };
     Ok(Some(Recorder::start(folder, arguments.record_episodes, bundle, engine)?))
+}
+
+fn start_logger(
+    arguments: &RunArguments,
+    policy: &Policy,
+    engine: EngineSettings,
+    sampling: Sampling,
+) -> anyhow::Result<Option<Logger>> {
+    let Some(file) = &arguments.log else { return Ok(None) };
+    let settings = LogSettings::new(&arguments.instance, engine, sampling);
+    Ok(Some(Logger::start(file, policy, settings)?))
+}
+
+fn logged_line(log: &LogSummary) -> String {
+    let LogSummary { file, ticks, dropped, bytes } = log;
+    let mib = *bytes as f64 / f64::from(1 << 20);
+    format!("logged     {}: {ticks} ticks, {dropped} dropped, {mib:.1} MiB\n", file.display())
 }
 
 fn finish_recorder(recorder: Option<Recorder>) -> anyhow::Result<Recorded> {

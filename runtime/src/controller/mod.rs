@@ -95,6 +95,8 @@ pub struct Tick<'a> {
     pub observation: &'a Observation,
     /// Whether the policy's state started anew.
     pub is_first: bool,
+    /// When the observation was received, in ns of the monotonic clock.
+    pub received_ns: u64,
     /// What was sent.
     pub answer: Action,
     /// The policy after the tick; its state is that of the last good tick where the answer is a fallback.
@@ -248,7 +250,7 @@ impl Controller {
         };
         let answer = self.send(observation, source, action, received_ns)?;
         self.count_episode(observation, is_first);
-        self.show(observation, is_first, answer, observers);
+        self.show(observation, is_first, received_ns, answer, observers);
         self.finish_episode(observation);
         Ok(())
     }
@@ -338,12 +340,23 @@ impl Controller {
         &self,
         observation: &Observation,
         is_first: bool,
+        received_ns: u64,
         answer: Action,
         observers: &mut [&mut dyn TickObserver],
     ) {
         let Some(running) = self.running else { return };
         let Self { policy, telemetry, counters, episodes, .. } = self;
-        let tick = Tick { observation, is_first, answer, policy, telemetry, counters, episodes, running };
+        let tick = Tick {
+            observation,
+            is_first,
+            received_ns,
+            answer,
+            policy,
+            telemetry,
+            counters,
+            episodes,
+            running,
+        };
         for observer in observers {
             observer.ticked(&tick);
         }

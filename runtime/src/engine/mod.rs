@@ -9,10 +9,10 @@ mod tract;
 mod weights;
 
 use rcwm_models::bundle::{Bundle, DType, PartName, TensorSpec};
-use serde::Serialize;
+use serde::{Deserialize, Serialize};
 
 /// Which engine.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, Hash, Serialize, clap::ValueEnum)]
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Hash, Serialize, Deserialize, clap::ValueEnum)]
 #[serde(rename_all = "lowercase")]
 pub enum EngineKind {
     /// tract, compiled in.
@@ -39,7 +39,7 @@ impl std::fmt::Display for EngineKind {
 }
 
 /// Which engine, and how much of the machine it may use.
-#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
 pub struct EngineSettings {
     /// Which engine.
     pub kind: EngineKind,

@@ -146,7 +146,16 @@ fn start<T: Send + 'static>(
     fallback: Fallback,
     run: impl FnOnce(&mut Controller) -> T + Send + 'static,
 ) -> JoinHandle<T> {
-    let policy = Policy::load(bundle, EngineSettings::tract()).unwrap();
+    start_with(Policy::load(bundle, EngineSettings::tract()).unwrap(), link, fallback, run)
+}
+
+/// Starts a controller of a policy in another thread.
+pub fn start_with<T: Send + 'static>(
+    policy: Policy,
+    link: &OwnLink,
+    fallback: Fallback,
+    run: impl FnOnce(&mut Controller) -> T + Send + 'static,
+) -> JoinHandle<T> {
     let first_timeout = Some(NEVER);
     let link = link.0.clone();
     let settings = ControllerSettings { link, episodes_max: None, stay: false, first_timeout, fallback };
