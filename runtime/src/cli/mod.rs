@@ -10,9 +10,11 @@
 
 mod bench;
 mod inspect;
+mod observers;
 mod replay;
 mod run;
 mod status;
+mod telemetry;
 mod verify;
 
 use std::path::{Path, PathBuf};
@@ -67,6 +69,8 @@ enum Verb {
     Bench(bench::BenchArguments),
     /// Makes a logged run's decisions again and compares them bit for bit; turns a log into episodes
     Replay(replay::ReplayArguments),
+    /// Shows the latencies of a logged run, and writes and draws them
+    Telemetry(telemetry::TelemetryArguments),
 }
 
 /// One engine or all that are there.
@@ -106,6 +110,7 @@ pub fn main() -> ExitCode {
         Verb::Inspect(arguments) => inspect::run(&arguments),
         Verb::Bench(arguments) => bench::run(&arguments),
         Verb::Replay(arguments) => replay::run(&arguments),
+        Verb::Telemetry(arguments) => telemetry::run(&arguments),
     };
     match result {
         Ok(()) => ExitCode::SUCCESS,

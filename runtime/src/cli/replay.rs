@@ -8,7 +8,8 @@ use clap::Args;
 use serde::Serialize;
 
 use crate::engine::{EngineKind, EngineSettings};
-use crate::log::{LogReader, ReplayReport, Replayer, WrittenEpisodes, write_episodes};
+use crate::log::{BundleIdentity, LogReader, ReplayReport, Replayer, WrittenEpisodes, write_episodes};
+use crate::telemetry::LatencyFiles;
 
 /// Arguments of `replay`.
 #[derive(Debug, Args)]
@@ -32,6 +33,8 @@ pub(super) struct ReplayArguments {
     /// Writes the logged episodes into this folder as Dreamer's .npz files, one sub-folder a task
     #[arg(long, value_name = "DIR")]
     episodes: Option<PathBuf>,
+    #[command(flatten)]
+    latency_files: LatencyFiles,
     /// Writes everything to this file as JSON
     #[arg(long, value_name = "FILE")]
     json: Option<PathBuf>,
@@ -77,7 +80,14 @@ fn replay(arguments: &ReplayArguments, stop: &AtomicBool) -> anyhow::Result<Repl
     let engine = arguments.engine.filter(|kind| *kind != log.header().engine.kind);
     let engine = engine.map(EngineSettings::single_threaded);
     let mut replayer = Replayer::new(log.header(), &arguments.bundle, engine)?;
-    with_bar(stop, "replaying", |go_on| replayer.run(&mut log, go_on)).context("replaying")
+    let report = with_bar(stop, "replaying", |go_on| replayer.run(&mut log, go_on)).context("replaying")?;
+    let BundleIdentity { preset, task, .. } = &report.log.bundle;
+    let title =
+        format!("{preset} bundle for {task}, engine {}: {} replayed ticks", report.engine.kind, report.ticks);
+    if report.ticks_compared > 0 {
+        arguments.latency_files.write(replayer.telemetry(), &title, None)?;
+    }
+    Ok(report)
 }
 
 fn write(

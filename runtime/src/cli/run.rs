@@ -6,21 +6,20 @@ use std::time::Duration;
 
 use anyhow::Context;
 use clap::Args;
-use rcwm_models::bundle::Bundle;
 use rcwm_models::wire::LinkSettings;
 
+use super::observers::{ObserverArguments, Observers};
 use super::status::StatusLine;
 use crate::controller::{Controller, ControllerSettings, Ended, Fallback, TickObserver};
 use crate::engine::{EngineKind, EngineSettings};
-use crate::log::{LogSettings, LogSummary, Logger};
 use crate::policy::{Policy, Sampling};
-use crate::record::{Recorded, Recorder};
 
 /// Arguments of `run`.
 #[derive(Debug, Args)]
 #[command(after_help = "Examples:\n  \
     rcwm-simulator serve --task reach --instance demo --episodes 3 &\n  \
-    rcwm-runtime run --bundle models/bundles/debug --instance demo --record runs/demo\n\n\
+    rcwm-runtime run --bundle models/bundles/debug --instance demo --record runs/demo\n  \
+    rcwm-runtime run --bundle models/bundles/debug --instance demo --log demo.rcwmlog --telemetry demo.jsonl\n\n\
     Ends when the simulator says that it closes, after --episodes, or on Ctrl-C. A simulator that dies is waited for:\n\
     the run goes on with the next one on the instance.")]
 pub(super) struct RunArguments {
@@ -57,15 +56,8 @@ pub(super) struct RunArguments {
     /// How long a wait polls before it blocks, in microseconds
     #[arg(long, value_name = "US", default_value_t = 50)]
     spin_us: u64,
-    /// Records films, strips and episodes into this folder
-    #[arg(long, value_name = "DIR")]
-    record: Option<PathBuf>,
-    /// Records at most this many episodes
-    #[arg(long, value_name = "N", default_value_t = 3)]
-    record_episodes: u64,
-    /// Logs every tick to this file, for `rcwm-runtime replay`; it must not exist yet
-    #[arg(long, value_name = "FILE")]
-    log: Option<PathBuf>,
+    #[command(flatten)]
+    observers: ObserverArguments,
     /// Writes the summary to this file as JSON
     #[arg(long, value_name = "FILE")]
     json: Option<PathBuf>,
@@ -87,23 +79,23 @@ pub(super) fn run(arguments: &RunArguments) -> anyhow::Result<()> {
         false => Sampling::Mode,
     };
     let policy = Policy::new(&bundle, engine, sampling)?;
-    let mut recorder = start_recorder(arguments, &bundle, engine)?;
-    let mut logger = start_logger(arguments, &policy, engine, sampling)?;
+    let mut observers =
+        Observers::start(&arguments.observers, &arguments.instance, &bundle, &policy, engine, sampling)?;
     let mut controller = Controller::open(policy, arguments.controller_settings())?;
-    let result = control(&mut controller, arguments, recorder.as_mut(), logger.as_mut(), &stop);
+    let result = control(&mut controller, arguments, &mut observers, &stop);
     let mut report = controller.report(arguments.engine, *result.as_ref().unwrap_or(&Ended::Failed));
+    let telemetry = controller.telemetry().clone();
     // The simulator is told before anything slow is done.
     let closed = controller.close();
-    report.frames_dropped = recorder.as_ref().map_or(0, Recorder::dropped);
-    let recorded = finish_recorder(recorder);
-    let logged = logger.map(Logger::finish).transpose();
+    report.frames_dropped = observers.frames_dropped();
+    let left = observers.finish();
     if report.counters.observations > 0 || result.is_ok() {
         print!("{}", report.summary());
         super::write_json(arguments.json.as_ref(), &report)?;
     }
     result?;
-    print!("{}", recorded_lines(&recorded?));
-    print!("{}", logged?.as_ref().map(logged_line).unwrap_or_default());
+    print!("{}", left?.lines());
+    print!("{}", arguments.observers.write_latencies(&telemetry, &report)?);
     Ok(closed?)
 }
 
@@ -123,66 +115,11 @@ impl RunArguments {
 fn control(
     controller: &mut Controller,
     arguments: &RunArguments,
-    recorder: Option<&mut Recorder>,
-    logger: Option<&mut Logger>,
+    observers: &mut Observers,
     stop: &AtomicBool,
 ) -> anyhow::Result<Ended> {
     let mut status = StatusLine::start(&arguments.instance).context("starting the status line")?;
-    let mut observers: Vec<&mut dyn TickObserver> = vec![&mut status];
-    if let Some(recorder) = recorder {
-        observers.push(recorder);
-    }
-    if let Some(logger) = logger {
-        observers.push(logger);
-    }
-    Ok(controller.run(stop, &mut observers)?)
-}
-
-fn start_recorder(
-    arguments: &RunArguments,
-    bundle: &Bundle,
-    engine: EngineSettings,
-) -> anyhow::Result<Option<Recorder>> {
-    let Some(folder) = &arguments.record else { return Ok(None) };
-    Ok(Some(Recorder::start(folder, arguments.record_episodes, bundle, engine)?))
-}
-
-fn start_logger(
-    arguments: &RunArguments,
-    policy: &Policy,
-    engine: EngineSettings,
-    sampling: Sampling,
-) -> anyhow::Result<Option<Logger>> {
-    let Some(file) = &arguments.log else { return Ok(None) };
-    let settings = LogSettings::new(&arguments.instance, engine, sampling);
-    Ok(Some(Logger::start(file, policy, settings)?))
-}
-
-fn logged_line(log: &LogSummary) -> String {
-    let LogSummary { file, ticks, dropped, bytes } = log;
-    let mib = *bytes as f64 / f64::from(1 << 20);
-    format!("logged     {}: {ticks} ticks, {dropped} dropped, {mib:.1} MiB\n", file.display())
-}
-
-fn finish_recorder(recorder: Option<Recorder>) -> anyhow::Result<Recorded> {
-    let Some(recorder) = recorder else { return Ok(Recorded::default()) };
-    let bar = indicatif::ProgressBar::new_spinner().with_message("writing films and episodes");
-    bar.enable_steady_tick(Duration::from_millis(200));
-    let recorded = recorder.finish()?;
-    bar.finish_and_clear();
-    Ok(recorded)
-}
-
-fn recorded_lines(recorded: &Recorded) -> String {
-    let mut text = String::new();
-    for path in recorded.films.iter().chain(&recorded.episodes) {
-        text += &format!("recorded   {}\n", path.display());
-    }
-    if recorded.broken_episodes > 0 {
-        text += &format!(
-            "recorded   {} episode(s) without .npz: observations of them were lost\n",
-            recorded.broken_episodes
-        );
-    }
-    text
+    let mut all: Vec<&mut dyn TickObserver> = vec![&mut status];
+    all.extend(observers.all());
+    Ok(controller.run(stop, &mut all)?)
 }

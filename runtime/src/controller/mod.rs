@@ -387,6 +387,12 @@ impl Controller {
             .with_latencies(self.telemetry.latencies())
     }
 
+    /// Latencies so far.
+    #[must_use]
+    pub fn telemetry(&self) -> &Telemetry {
+        &self.telemetry
+    }
+
     /// Tells the simulator that no further action will come.
     ///
     /// # Errors

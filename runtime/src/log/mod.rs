@@ -15,6 +15,7 @@
 
 mod episodes;
 mod frames;
+mod latencies;
 mod logger;
 mod pack;
 mod reader;
@@ -23,6 +24,7 @@ mod replay;
 mod worker;
 
 pub use episodes::{WrittenEpisodes, write_episodes};
+pub use latencies::{LoggedLatencies, LoggedLatencyReport};
 pub use logger::{LogSettings, LogSummary, Logger};
 pub use reader::{Entry, LogReader, LoggedTick};
 pub use record::{BundleIdentity, Header, KEYFRAME_TICKS, LoggedCall, Machine, Record, TickRecord};
