@@ -10,10 +10,11 @@ use std::sync::atomic::AtomicBool;
 use assert_cmd::Command;
 use rcwm_models::bundle::{Bundle, PartName};
 use rcwm_models::episode::Episode;
-use rcwm_models::wire::ObservationFlags;
-use rcwm_runtime::controller::Fallback;
+use rcwm_models::wire::{Action, ActionSource, ObservationFlags};
+use rcwm_runtime::controller::{Counters, EpisodeResult, Fallback, Tick, TickObserver};
 use rcwm_runtime::log::{Entry, LogReader, LogSettings, LogSummary, Logger, ReplayReport, Replayer};
-use rcwm_runtime::policy::Sampling;
+use rcwm_runtime::policy::{CallOutcome, Sampling};
+use rcwm_runtime::telemetry::Telemetry;
 use rcwm_runtime::{EngineSettings, Policy};
 use support::{ask, dividing_by_zero, observation, own_link, smallest_bundle, start_with, with_manifest};
 
@@ -246,4 +247,74 @@ fn the_replay_verb_says_so_and_writes_episodes() {
     assert_eq!(episodes.iter().map(Episode::len).collect::<Vec<_>>(), [10, 10, 5]);
     assert!(episodes[0].is_first[0] && episodes[0].is_last[9] && !episodes[2].is_last[4]);
     assert!(episodes[0].image.iter().eq((0..10).flat_map(support::image).collect::<Vec<_>>().iter()));
+}
+
+#[test]
+fn a_controller_that_goes_back_to_an_earlier_state_is_replayed() {
+    let bundle = Bundle::open(&smallest_bundle()).unwrap();
+    let mut policy = Policy::new(&bundle, EngineSettings::tract(), Sampling::Sample { seed: 3 }).unwrap();
+    let mut log = CallLog::start(&policy);
+    policy.observe(&support::image(0), None).unwrap();
+    log.tick(&policy, 0);
+    // Imagined twice, then the first of both frames comes after all.
+    let before = policy.state().clone();
+    policy.work_ahead(Some(&[0.1; 4])).unwrap();
+    policy.imagine(&[0.1; 4]).unwrap();
+    policy.imagine(&[0.2; 4]).unwrap();
+    policy.set_state(&before).unwrap();
+    policy.observe(&support::image(1), Some(&[0.3; 4])).unwrap();
+    log.tick(&policy, 1);
+    let report = log.replay();
+    assert_eq!(report.first_difference, None);
+    assert_eq!((report.calls, report.ticks_compared), (6, 2));
+}
+
+/// A log of a policy that a test asks itself.
+struct CallLog {
+    folder: tempfile::TempDir,
+    logger: Logger,
+}
+
+impl CallLog {
+    fn start(policy: &Policy) -> Self {
+        let folder = tempfile::tempdir().unwrap();
+        let settings = LogSettings::new("test", EngineSettings::tract(), Sampling::Sample { seed: 3 });
+        let logger = Logger::start(&folder.path().join("log"), policy, settings).unwrap();
+        Self { folder, logger }
+    }
+
+    fn tick(&mut self, policy: &Policy, step: u32) {
+        let observation = observation(u64::from(step), step);
+        let action = policy.calls_since(0).last().and_then(|call| match call.outcome {
+            CallOutcome::Decided { action, .. } => Some(action),
+            _ => None,
+        });
+        let source = ActionSource::Policy as u32;
+        let answer = Action {
+            answers: u64::from(step),
+            published_ns: 2,
+            source,
+            reserved: 0,
+            action: action.unwrap(),
+        };
+        let (telemetry, counters) = (Telemetry::new(), Counters::default());
+        self.logger.ticked(&Tick {
+            observation: &observation,
+            is_first: step == 0,
+            received_ns: 1,
+            answer,
+            policy,
+            telemetry: &telemetry,
+            counters: &counters,
+            episodes: &[],
+            running: EpisodeResult::start(&observation),
+        });
+    }
+
+    fn replay(self) -> ReplayReport {
+        let summary = self.logger.finish().unwrap();
+        let report = replay(&summary.file, &smallest_bundle());
+        drop(self.folder);
+        report
+    }
 }

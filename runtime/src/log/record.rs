@@ -258,6 +258,8 @@ pub struct LoggedCall {
 pub enum LoggedOutcome {
     /// Work ahead was done.
     Done,
+    /// The policy went back to an earlier state, the one with this checksum.
+    StateSet(u32),
     /// A decision was made.
     Decided {
         /// The action.

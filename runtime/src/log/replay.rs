@@ -1,5 +1,6 @@
 //! The same calls once more.
 
+use std::collections::VecDeque;
 use std::path::{Path, PathBuf};
 use std::time::Instant;
 
@@ -12,7 +13,7 @@ use super::LogError;
 use super::reader::{Entry, LogReader, LoggedTick};
 use super::record::{BundleIdentity, Header, LoggedCall, LoggedOutcome, TickRecord, WholeState, digest};
 use crate::engine::EngineSettings;
-use crate::policy::{CallKind, CallOutcome, Policy};
+use crate::policy::{CallKind, CallOutcome, Policy, State};
 use crate::telemetry::{Latency, Stage, Telemetry, table};
 
 /// Where a replay differs from the log.
@@ -75,7 +76,12 @@ pub struct Replayer {
     telemetry: Telemetry,
     report: ReplayReport,
     resumed: bool,
+    /// The last states, by their checksums: the controller may go back to one of them.
+    states: VecDeque<(u32, State)>,
 }
+
+/// States that are remembered: more than are imagined in a row.
+const STATES_MAX: usize = 1024;
 
 impl Replayer {
     /// Loads the bundle that the log was made with; `bundles` are the folders it is looked for in, and those that took over.
@@ -96,7 +102,8 @@ impl Replayer {
         let bundles = bundles.iter().map(open).collect::<Result<Vec<_>, _>>()?;
         let policy = load(&bundles, &header.bundle, header, engine)?;
         let report = ReplayReport::new(header.clone(), engine);
-        Ok(Self { engine, bundles, policy, telemetry: Telemetry::new(), report, resumed: false })
+        let states = VecDeque::with_capacity(STATES_MAX);
+        Ok(Self { engine, bundles, policy, telemetry: Telemetry::new(), report, resumed: false, states })
     }
 
     /// Replays the whole log; `go_on` is asked after every entry with the bytes read and in all.
@@ -136,6 +143,7 @@ impl Replayer {
 
     fn exchange(&mut self, identity: &BundleIdentity) -> Result<(), LogError> {
         self.policy = load(&self.bundles, identity, &self.report.log, self.engine)?;
+        self.states.clear();
         self.report.swaps += 1;
         Ok(())
     }
@@ -173,6 +181,7 @@ impl Replayer {
             self.policy.set_state(&state).is_ok()
         });
         self.resumed = true;
+        self.states.clear();
         if !taken {
             let what = "the state after dropped ticks".to_owned();
             self.differs(tick, Some([what, "missing, or of another size".into(), "the model's size".into()]));
@@ -185,8 +194,15 @@ impl Replayer {
         let start = Instant::now();
         let mut answered = false;
         for call in &tick.record.calls {
-            let replayed = self.call(call, tick)?;
-            answered |= call.kind != CallKind::WorkAhead;
+            let Some(replayed) = self.call(call, tick) else {
+                let what = "what the policy was asked".to_owned();
+                return Some([
+                    what,
+                    format!("{:?}", call.kind),
+                    "the log does not hold what that needs".into(),
+                ]);
+            };
+            answered |= matches!(call.kind, CallKind::Observe | CallKind::Imagine);
             let difference = self.compare(&call.outcome, &replayed);
             first = first.or(difference);
         }
@@ -199,6 +215,7 @@ impl Replayer {
     /// Makes one call; none where the log does not hold what it needs.
     fn call(&mut self, call: &LoggedCall, tick: &LoggedTick) -> Option<LoggedOutcome> {
         let action = call.action.as_ref();
+        self.remember();
         let made = self.policy.calls_made();
         match (call.kind, action, &tick.observation) {
             (CallKind::WorkAhead, ..) => drop(self.policy.work_ahead(action)),
@@ -206,6 +223,7 @@ impl Replayer {
             (CallKind::Observe, _, Some(observation)) => {
                 drop(self.policy.observe(&observation.image, action))
             }
+            (CallKind::SetState, ..) => self.go_back(&call.outcome)?,
             (CallKind::Imagine, None, _) | (CallKind::Observe, _, None) => return None,
         }
         let outcome = self.policy.calls_since(made).next()?.outcome;
@@ -217,6 +235,29 @@ impl Replayer {
             }
         }
         Some(outcome.into())
+    }
+
+    fn remember(&mut self) {
+        let state = self.policy.state();
+        let checksum = state.checksum();
+        if self.states.back().is_some_and(|(last, _)| *last == checksum) {
+            return;
+        }
+        // The oldest makes room, and its memory is used again.
+        let mut place = match self.states.len() {
+            STATES_MAX => self.states.pop_front().unwrap_or_default(),
+            _ => Default::default(),
+        };
+        place.0 = checksum;
+        place.1.clone_from(state);
+        self.states.push_back(place);
+    }
+
+    /// Goes back to the state that the log names; none where it is not known.
+    fn go_back(&mut self, outcome: &LoggedOutcome) -> Option<()> {
+        let LoggedOutcome::StateSet(wanted) = outcome else { return None };
+        let (_, state) = self.states.iter().rev().find(|(checksum, _)| checksum == wanted)?;
+        self.policy.set_state(state).ok()
     }
 
     fn compare(&mut self, logged: &LoggedOutcome, replayed: &LoggedOutcome) -> Option<[String; 3]> {
@@ -272,6 +313,7 @@ fn answer(record: &TickRecord) -> Option<[String; 3]> {
 fn said(outcome: &LoggedOutcome) -> String {
     match outcome {
         LoggedOutcome::Done => "work ahead was done".into(),
+        LoggedOutcome::StateSet(checksum) => format!("went back to the state {checksum:08x}"),
         LoggedOutcome::Decided { action, .. } => format!("decided {action:?}"),
         LoggedOutcome::Failed(reason) => reason.clone(),
     }

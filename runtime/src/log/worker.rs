@@ -129,6 +129,7 @@ impl From<CallOutcome> for LoggedOutcome {
     fn from(outcome: CallOutcome) -> Self {
         match outcome {
             CallOutcome::Done => Self::Done,
+            CallOutcome::StateSet { checksum } => Self::StateSet(checksum),
             CallOutcome::Decided { action, recomputed, surprise, stage_ns } => {
                 Self::Decided { action, recomputed, surprise, stage_ns: stage_ns.to_vec() }
             }

@@ -20,6 +20,8 @@ pub enum CallKind {
     Observe,
     /// [`super::Policy::imagine`].
     Imagine,
+    /// [`super::Policy::set_state`].
+    SetState,
 }
 
 /// How a call ended.
@@ -27,6 +29,11 @@ pub enum CallKind {
 pub enum CallOutcome {
     /// Work ahead was done.
     Done,
+    /// The state with this checksum was taken over.
+    StateSet {
+        /// See [`super::State::checksum`].
+        checksum: u32,
+    },
     /// A decision was made.
     Decided {
         /// The action, within the bundle's limits.

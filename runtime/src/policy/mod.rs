@@ -308,6 +308,7 @@ impl Policy {
         }
         self.state.clone_from(state);
         self.ahead = None;
+        self.calls.note(CallKind::SetState, None, CallOutcome::StateSet { checksum: state.checksum() });
         Ok(())
     }
 
@@ -333,7 +334,7 @@ impl Policy {
         self.calls.policy()
     }
 
-    /// Calls of [`Self::observe`], [`Self::imagine`] and [`Self::work_ahead`] so far.
+    /// Calls of [`Self::observe`], [`Self::imagine`], [`Self::work_ahead`] and [`Self::set_state`] so far.
     #[must_use]
     pub fn calls_made(&self) -> u64 {
         self.calls.made()

@@ -146,7 +146,7 @@ fn draw(area: &Area<'_>, title: &str, lines: &[Line], period: Option<f64>) -> Re
         .x_labels(0)
         .y_labels(0)
         .x_desc("percentile of ticks")
-        .y_desc("latency, µs")
+        .y_desc("latency, μs")
         .axis_desc_style((FAMILY, 16))
         .axis_style(BLACK.mix(0.5))
         .draw()?;

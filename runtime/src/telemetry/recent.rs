@@ -2,8 +2,8 @@
 
 use super::Stage;
 
-/// Recordings that are remembered: a few ticks.
-pub const RECENT_MAX: usize = 64;
+/// Recordings that are remembered: those of a tick after a long stall, which counts for each that it made late.
+pub const RECENT_MAX: usize = 2048;
 
 #[derive(Clone)]
 pub(super) struct Recent {
@@ -42,7 +42,10 @@ mod tests {
         for time_ns in 0..RECENT_MAX as u64 + 6 {
             recent.note(Stage::Actor, time_ns);
         }
-        assert_eq!(recent.since(68).collect::<Vec<_>>(), [(Stage::Actor, 68), (Stage::Actor, 69)]);
+        assert_eq!(
+            recent.since(RECENT_MAX as u64 + 4).collect::<Vec<_>>(),
+            [2052, 2053].map(|time_ns| (Stage::Actor, time_ns))
+        );
         assert_eq!((recent.since(0).count(), recent.since(0).next()), (RECENT_MAX, Some((Stage::Actor, 6))));
     }
 }

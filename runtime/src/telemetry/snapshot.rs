@@ -17,11 +17,11 @@ use serde::Serialize;
 
 use super::{Latency, Stage, Telemetry};
 use crate::controller::{Counters, Tick, TickObserver};
-use crate::policy::{CallOutcome, Surprise};
+use crate::policy::{CallOutcome, Policy, Surprise};
 
 /// Ticks that may wait to be taken up: one second at 4 kHz.
 const QUEUE_TICKS: usize = 4096;
-/// Recordings of a tick that are passed on.
+/// Recordings that are passed on at once; a tick that has more is passed on in pieces.
 const RECORDINGS_MAX: usize = 24;
 /// How often the queue is looked at. The thread sleeps in between instead of waiting on the queue, so that the loop need not wake it.
 const LOOK: Duration = Duration::from_millis(50);
@@ -53,8 +53,10 @@ pub enum SnapshotError {
     Thread(String),
 }
 
-/// What a tick adds.
+/// What a tick adds, or a piece of it.
 struct Sample {
+    /// It is the last piece of its tick.
+    whole: bool,
     recordings: [(Stage, u64); RECORDINGS_MAX],
     count: usize,
     surprise: Option<Surprise>,
@@ -103,37 +105,51 @@ impl Snapshots {
         }
     }
 
-    fn sample(&mut self, tick: &Tick<'_>) -> Sample {
-        let (telemetry, policy) = (tick.telemetry, tick.policy);
-        let mut recordings = [(Stage::Tick, 0); RECORDINGS_MAX];
-        let mut count = 0;
-        for (place, recording) in recordings.iter_mut().zip(telemetry.recorded_since(self.recordings_seen)) {
-            *place = recording;
-            count += 1;
-        }
-        self.recordings_seen = telemetry.recorded();
+    /// What was decided since the last tick.
+    fn surprise(&mut self, policy: &Policy) -> Option<Surprise> {
         if policy.number() != self.policy {
             (self.policy, self.calls_seen) = (policy.number(), 0);
         }
-        let surprise = policy.calls_since(self.calls_seen).filter_map(|call| match call.outcome {
+        let surprises = policy.calls_since(self.calls_seen).filter_map(|call| match call.outcome {
             CallOutcome::Decided { surprise, .. } => surprise,
             _ => None,
         });
-        let surprise = surprise.last();
+        let surprise = surprises.last();
         self.calls_seen = policy.calls_made();
-        Sample { recordings, count, surprise, counters: *tick.counters }
+        surprise
     }
-}
 
-impl TickObserver for Snapshots {
-    fn ticked(&mut self, tick: &Tick<'_>) {
-        let sample = self.sample(tick);
+    fn send(&self, sample: Sample) {
         // Nobody hears it only when the thread has ended with an error, which `finish` will report.
         if let Some(queue) = &self.queue
             && queue.try_send(sample).is_err()
         {
             self.dropped.fetch_add(1, Ordering::Relaxed);
         }
+    }
+}
+
+impl TickObserver for Snapshots {
+    fn ticked(&mut self, tick: &Tick<'_>) {
+        let counters = *tick.counters;
+        let piece = || Sample {
+            whole: false,
+            recordings: [(Stage::Tick, 0); RECORDINGS_MAX],
+            count: 0,
+            surprise: None,
+            counters,
+        };
+        let mut sample = piece();
+        for recording in tick.telemetry.recorded_since(self.recordings_seen) {
+            if sample.count == RECORDINGS_MAX {
+                self.send(std::mem::replace(&mut sample, piece()));
+            }
+            sample.recordings[sample.count] = recording;
+            sample.count += 1;
+        }
+        self.recordings_seen = tick.telemetry.recorded();
+        (sample.whole, sample.surprise) = (true, self.surprise(tick.policy));
+        self.send(sample);
     }
 }
 
@@ -172,7 +188,7 @@ struct SnapshotLine<'a> {
     interval: Summary,
     total: Summary,
     counters: &'a Counters,
-    /// Ticks that are missing in the statistics because the queue was full.
+    /// Ticks, or pieces of one, that are missing in the statistics because the queue was full.
     samples_dropped: u64,
 }
 
@@ -184,7 +200,7 @@ impl Gathered {
     }
 
     fn add(&mut self, sample: &Sample) {
-        self.ticks += 1;
+        self.ticks += u64::from(sample.whole);
         for (stage, time_ns) in &sample.recordings[..sample.count] {
             self.telemetry.record(*stage, *time_ns);
         }
