@@ -4,7 +4,9 @@
 //! | --- | --- |
 //! | [`engine`] | what runs an ONNX part: tract, or ONNX Runtime (feature `ort`) |
 //! | [`policy`] | one tick: image and executed action in, action distribution out; carries z and h of both branches |
-//! | [`controller`] | the loop over shared memory: order of observations, fallback, action limits, counters |
+//! | [`controller`] | the loop over shared memory: state machine, fallback, action limits, counters |
+//! | [`pacing`] | when the next observation is due, how to wait for it, when it counts as late |
+//! | [`realtime`] | what Linux grants a thread that must be on time |
 //! | [`telemetry`] | latency histograms, one per stage |
 //! | [`record`] | films, strips and episodes of what the policy saw, written beside the loop |
 //! | [`mod@log`] | every tick of a run, replayed bit for bit or turned into episodes |
@@ -36,7 +38,9 @@ pub mod controller;
 pub mod engine;
 pub mod inspect;
 pub mod log;
+pub mod pacing;
 pub mod policy;
+pub mod realtime;
 pub mod record;
 pub mod telemetry;
 pub mod verify;

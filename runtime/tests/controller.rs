@@ -5,10 +5,12 @@ mod support;
 use rcwm_models::bundle::PartName;
 use rcwm_models::wire::{ActionSource, ObservationFlags};
 use rcwm_runtime::controller::{Ended, Fallback};
+use rcwm_runtime::pacing::PacingSettings;
 use rcwm_runtime::telemetry::Stage;
 use rcwm_runtime::{EngineSettings, Policy};
 use support::{
-    ask, dividing_by_zero, image, observation, own_link, smallest_bundle, start_controller, with_manifest,
+    ask, dividing_by_zero, image, observation, own_link, smallest_bundle, start_controller,
+    start_controller_with, with_manifest,
 };
 
 #[test]
@@ -152,19 +154,42 @@ fn a_simulator_that_was_started_again_is_served_from_its_first_observation() {
 fn a_late_answer_in_real_time_is_a_missed_deadline() {
     let link = own_link();
     let peer = link.peer();
-    let controller = start_controller(&smallest_bundle(), &link, Fallback::Hold);
+    // Nothing is overdue or stale here.
+    let pacing = PacingSettings { grace_periods: 1e12, stale_periods: 1e12, ..PacingSettings::default() };
+    let controller = start_controller_with(&smallest_bundle(), &link, |settings| settings.pacing = pacing);
     // The first lasts a nanosecond: the answer is late even from when it was published. The second lasts 10 s and was due
     // 20 s ago: only the simulator is late. The third is due for ever.
     const LONG_NS: u64 = 10_000_000_000;
-    let long_ago = rcwm_models::wire::clock::monotonic_ns().saturating_sub(2 * LONG_NS);
+    let now = rcwm_models::wire::clock::monotonic_ns();
     for (sequence, (scheduled_ns, period_ns)) in
-        [(0, 1), (long_ago, LONG_NS), (0, u64::MAX)].into_iter().enumerate()
+        [(now, 1), (now.saturating_sub(2 * LONG_NS), LONG_NS), (now, u64::MAX)].into_iter().enumerate()
     {
         let mut sent = observation(sequence as u64, sequence as u32);
         (sent.scheduled_ns, sent.period_ns) = (scheduled_ns, period_ns);
         ask(&peer, &sent);
     }
     peer.close().unwrap();
-    let counters = controller.join().unwrap().counters;
+    let counters = controller.join().unwrap().1.counters;
     assert_eq!((counters.missed_deadlines, counters.missed_deadlines_published_late), (2, 1));
+}
+
+#[test]
+fn work_ahead_is_done_once_a_tick_and_again_where_another_action_was_executed() {
+    let link = own_link();
+    let peer = link.peer();
+    let controller = start_controller(&smallest_bundle(), &link, Fallback::Hold);
+    let mut sent = observation(0, 0);
+    for sequence in 1..=10 {
+        let answer = ask(&peer, &sent);
+        sent = observation(sequence, sequence as u32);
+        // Every other time what was asked for is what was executed.
+        if sequence % 2 == 0 {
+            sent.executed_action = answer.action;
+        }
+    }
+    ask(&peer, &sent);
+    peer.close().unwrap();
+    let report = controller.join().unwrap();
+    let ahead = report.latency.iter().find(|latency| latency.stage == Stage::Ahead).unwrap().count;
+    assert_eq!((ahead, report.counters.recomputed), (11, 5));
 }

@@ -6,17 +6,23 @@ mod support;
 
 use std::path::Path;
 use std::sync::atomic::AtomicBool;
+use std::time::Duration;
 
 use assert_cmd::Command;
 use rcwm_models::bundle::{Bundle, PartName};
 use rcwm_models::episode::Episode;
-use rcwm_models::wire::{Action, ActionSource, ObservationFlags};
-use rcwm_runtime::controller::{Counters, EpisodeResult, Fallback, Tick, TickObserver};
+use rcwm_models::wire::clock::monotonic_ns;
+use rcwm_models::wire::{Action, ActionSource, Observation, ObservationFlags, SimulatorLink, Wait};
+use rcwm_runtime::controller::{
+    ControllerSettings, Counters, EpisodeResult, Fallback, State, Tick, TickObserver, TickTimes,
+};
 use rcwm_runtime::log::{Entry, LogReader, LogSettings, LogSummary, Logger, ReplayReport, Replayer};
 use rcwm_runtime::policy::{CallOutcome, Sampling};
 use rcwm_runtime::telemetry::Telemetry;
 use rcwm_runtime::{EngineSettings, Policy};
-use support::{ask, dividing_by_zero, observation, own_link, smallest_bundle, start_with, with_manifest};
+use support::{
+    ask, dividing_by_zero, observation, own_link, smallest_bundle, start_changed, start_with, with_manifest,
+};
 
 /// Runs a controller with a log on observations that a peer publishes: `ticks` of them in episodes of 10, of which some are not
 /// fit, and some say that another action was executed than was sent.
@@ -77,6 +83,73 @@ fn a_run_is_replayed_bit_for_bit_with_the_mode_and_with_samples() {
         // The observations that hold NaN.
         assert_eq!(report.answers, [58, 0, 2]);
     }
+}
+
+#[test]
+fn imagined_rate_limited_fallback_and_late_ticks_are_replayed() {
+    const PERIOD_NS: u64 = 40_000_000;
+    let (link, folder) = (own_link(), tempfile::tempdir().unwrap());
+    let peer = link.peer();
+    let bundle = Bundle::open(&smallest_bundle()).unwrap();
+    let sampling = Sampling::Sample { seed: 6 };
+    let policy = Policy::new(&bundle, EngineSettings::tract(), sampling).unwrap();
+    let (fallback, rate_max) = (Fallback::Given([0.5, -0.5, 0.0, 3.0]), Some(0.03));
+    let settings =
+        LogSettings { fallback, rate_max, ..LogSettings::new("test", EngineSettings::tract(), sampling) };
+    let file = folder.path().join("run.rcwmlog");
+    let mut logger = Logger::start(&file, &policy, settings).unwrap();
+    let limit = move |settings: &mut ControllerSettings| {
+        (settings.fallback, settings.rate_max) = (fallback, rate_max);
+        settings.ticks.imagined_ticks_max = 3;
+    };
+    let controller = start_changed(policy, &link, limit, move |controller| {
+        controller.run(&AtomicBool::new(false), &mut [&mut logger]).unwrap();
+        logger.finish().unwrap()
+    });
+    let real_time = |sequence: u64, step: u32| {
+        let mut sent = observation(sequence, step);
+        (sent.period_ns, sent.scheduled_ns) = (PERIOD_NS, monotonic_ns());
+        sent
+    };
+    ask_now(&peer, || real_time(0, 0));
+    // Silence: some ticks are imagined.
+    let imagined = wait_for(&peer, ActionSource::Imagined);
+    // It comes after all.
+    peer.publish(|slot| *slot = real_time(imagined.answers, 1)).unwrap();
+    let fallback = wait_for(&peer, ActionSource::Fallback);
+    let next = fallback.answers + 3;
+    ask_now(&peer, || real_time(next, 2));
+    peer.close().unwrap();
+    controller.join().unwrap();
+    let report = replay(&file, &smallest_bundle());
+    assert_eq!(report.first_difference, None);
+    let [observed, imagined, fallback] = report.answers;
+    assert!(observed >= 2 && imagined >= 1 && fallback >= 1, "{:?}", report.answers);
+    assert_eq!(report.ticks_compared, report.ticks);
+}
+
+/// Waits for an answer of this source.
+fn wait_for(peer: &SimulatorLink, source: ActionSource) -> Action {
+    loop {
+        if let (Wait::Message(action), _) = peer.wait_action(Duration::from_secs(20)).unwrap()
+            && action.source == source as u32
+        {
+            return action;
+        }
+    }
+}
+
+/// Publishes an observation that is due now until it is answered: one that was due long ago is stale.
+fn ask_now(peer: &SimulatorLink, due_now: impl Fn() -> Observation) {
+    for _ in 0..200 {
+        let sent = due_now();
+        peer.publish(|slot| *slot = sent).unwrap();
+        let answer = peer.wait_action(Duration::from_millis(100)).unwrap();
+        if matches!(answer, (Wait::Message(action), _) if action.answers == sent.sequence) {
+            return;
+        }
+    }
+    panic!("no answer");
 }
 
 #[test]
@@ -299,10 +372,14 @@ impl CallLog {
         };
         let (telemetry, counters) = (Telemetry::new(), Counters::default());
         self.logger.ticked(&Tick {
-            observation: &observation,
+            observation: Some(&observation),
             is_first: step == 0,
-            received_ns: 1,
+            rewound: false,
+            decision: None,
             answer,
+            overtaken: false,
+            state: State::default(),
+            times: TickTimes { scheduled_ns: 0, published_ns: 0, received_ns: 1, sent_ns: 2 },
             policy,
             telemetry: &telemetry,
             counters: &counters,

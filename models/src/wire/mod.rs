@@ -20,7 +20,7 @@ mod link;
 mod messages;
 
 pub use link::{
-    ControllerLink, Events, LinkError, LinkSettings, ObservationSample, ObservationSlot, ObserverLink,
-    SimulatorLink, Wait, forget_prefix, list_leftovers,
+    ActionObserverLink, ControllerLink, Events, LinkError, LinkSettings, ObservationSample, ObservationSlot,
+    ObserverLink, SimulatorLink, Wait, forget_prefix, list_leftovers,
 };
 pub use messages::{Action, ActionSource, Observation, ObservationFlags};

@@ -13,6 +13,7 @@ mod inspect;
 mod observers;
 mod replay;
 mod run;
+mod safety;
 mod status;
 mod telemetry;
 mod verify;
@@ -31,8 +32,32 @@ use serde::Serialize;
 use crate::controller::ControllerError;
 use crate::engine::EngineKind;
 
-const EXIT_NO_OBSERVATION: u8 = 3;
-const EXIT_AT_ONCE: i32 = 130;
+/// How the program ends; the numbers are documented in `--help` and in `docs/controller.md`.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+#[repr(u8)]
+enum Exit {
+    /// An error, or a bundle that did not verify. 2 is clap's, for usage.
+    Error = 1,
+    /// No observation came within --timeout.
+    NoObservation = 3,
+    /// The policy was unfit for --fallback-ticks-max ticks.
+    Stopped = 4,
+    /// The peer was silent for --silence-max.
+    PeerLost = 5,
+    /// A second Ctrl-C.
+    AtOnce = 130,
+}
+
+impl From<&anyhow::Error> for Exit {
+    fn from(error: &anyhow::Error) -> Self {
+        match error.downcast_ref::<ControllerError>() {
+            Some(ControllerError::NoObservation { .. }) => Self::NoObservation,
+            Some(ControllerError::Stopped { .. }) => Self::Stopped,
+            Some(ControllerError::PeerLost { .. }) => Self::PeerLost,
+            Some(ControllerError::Link(_)) | None => Self::Error,
+        }
+    }
+}
 
 /// Deploys an exported RCWM bundle as a controller.
 #[derive(Debug, Parser)]
@@ -51,7 +76,8 @@ Examples:
   rcwm-runtime replay --log runs/demo.rcwmlog --bundle models/bundles/debug
 
 Exit codes:
-  0 done (also after Ctrl-C), 1 error or not verified, 2 usage, 3 no observation within --timeout, 130 second Ctrl-C
+  0 done (also after Ctrl-C), 1 error or not verified, 2 usage, 3 no observation within --timeout, 4 stopped: the policy
+  was unfit for --fallback-ticks-max ticks, 5 the peer was silent for --silence-max, 130 second Ctrl-C
 
 Environment:
   ORT_DYLIB_PATH  ONNX Runtime's library, for --engine ort (PyPI onnxruntime: capi/libonnxruntime.so.1.31.1)
@@ -116,10 +142,7 @@ pub fn main() -> ExitCode {
         Ok(()) => ExitCode::SUCCESS,
         Err(error) => {
             eprintln!("error: {}", one_line(error.as_ref()));
-            match error.downcast_ref::<ControllerError>() {
-                Some(ControllerError::NoObservation { .. }) => ExitCode::from(EXIT_NO_OBSERVATION),
-                _ => ExitCode::FAILURE,
-            }
+            ExitCode::from(Exit::from(&error) as u8)
         }
     }
 }
@@ -133,6 +156,13 @@ fn open_bundle(folder: &Path) -> anyhow::Result<Bundle> {
         );
     }
     Bundle::open(folder).with_context(|| format!("{} is not a usable bundle", folder.display()))
+}
+
+fn seconds(text: &str) -> Result<f64, String> {
+    match text.parse::<f64>() {
+        Ok(value) if (0.0..=1e6).contains(&value) => Ok(value),
+        _ => Err("expected seconds, 0 to 1000000".into()),
+    }
 }
 
 fn write_json(path: Option<&PathBuf>, report: &impl Serialize) -> anyhow::Result<()> {
@@ -152,7 +182,7 @@ fn stop_flag() -> anyhow::Result<Arc<AtomicBool>> {
     let flag = Arc::clone(&stop);
     ctrlc::set_handler(move || {
         if flag.swap(true, Ordering::Relaxed) {
-            std::process::exit(EXIT_AT_ONCE);
+            std::process::exit(i32::from(Exit::AtOnce as u8));
         }
     })
     .context("listening for Ctrl-C")?;

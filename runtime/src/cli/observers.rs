@@ -7,9 +7,8 @@ use clap::Args;
 use rcwm_models::bundle::Bundle;
 
 use crate::controller::{Pace, RunReport, TickObserver};
-use crate::engine::EngineSettings;
 use crate::log::{LogSettings, LogSummary, Logger};
-use crate::policy::{Policy, Sampling};
+use crate::policy::Policy;
 use crate::record::{Recorded, Recorder};
 use crate::telemetry::{LatencyFiles, SnapshotSettings, Snapshots, Telemetry};
 
@@ -67,18 +66,16 @@ pub(super) struct Left {
 impl Observers {
     pub(super) fn start(
         arguments: &ObserverArguments,
-        instance: &str,
         bundle: &Bundle,
         policy: &Policy,
-        engine: EngineSettings,
-        sampling: Sampling,
+        log: LogSettings,
     ) -> anyhow::Result<Self> {
         let recorder = match &arguments.record {
-            Some(folder) => Some(Recorder::start(folder, arguments.record_episodes, bundle, engine)?),
+            Some(folder) => Some(Recorder::start(folder, arguments.record_episodes, bundle, log.engine)?),
             None => None,
         };
         let logger = match &arguments.log {
-            Some(file) => Some(Logger::start(file, policy, LogSettings::new(instance, engine, sampling))?),
+            Some(file) => Some(Logger::start(file, policy, log)?),
             None => None,
         };
         let every = arguments.telemetry_every;

@@ -6,12 +6,13 @@ use std::time::Duration;
 
 use anyhow::Context;
 use clap::Args;
-use rcwm_models::wire::LinkSettings;
 
-use super::observers::{ObserverArguments, Observers};
+use super::observers::{Left, ObserverArguments, Observers};
+use super::safety::{SafetyArguments, TimeArguments};
 use super::status::StatusLine;
-use crate::controller::{Controller, ControllerSettings, Ended, Fallback, TickObserver};
+use crate::controller::{Controller, ControllerError, ControllerSettings, Ended, TickObserver};
 use crate::engine::{EngineKind, EngineSettings};
+use crate::log::LogSettings;
 use crate::policy::{Policy, Sampling};
 
 /// Arguments of `run`.
@@ -19,9 +20,14 @@ use crate::policy::{Policy, Sampling};
 #[command(after_help = "Examples:\n  \
     rcwm-simulator serve --task reach --instance demo --episodes 3 &\n  \
     rcwm-runtime run --bundle models/bundles/debug --instance demo --record runs/demo\n  \
-    rcwm-runtime run --bundle models/bundles/debug --instance demo --log demo.rcwmlog --telemetry demo.jsonl\n\n\
+    rcwm-runtime run --bundle models/bundles/debug --instance demo --log demo.rcwmlog --telemetry demo.jsonl\n  \
+    rcwm-runtime run --bundle DIR --instance arm --realtime --cpu 3 --fallback zero --rate-limit 0.2 \\\n    \
+    --surprise-robot-max 20\n\n\
     Ends when the simulator says that it closes, after --episodes, or on Ctrl-C. A simulator that dies is waited for:\n\
-    the run goes on with the next one on the instance.")]
+    the run goes on with the next one on the instance. docs/controller.md draws what happens when.\n\n\
+    Exit codes:\n  \
+    0 done (also after Ctrl-C), 1 error, 2 usage, 3 no observation within --timeout, 4 stopped: the policy was unfit\n  \
+    for --fallback-ticks-max ticks, 5 the peer was silent for --silence-max, 130 second Ctrl-C")]
 pub(super) struct RunArguments {
     /// The bundle's folder
     #[arg(long, value_name = "DIR")]
@@ -42,7 +48,7 @@ pub(super) struct RunArguments {
     #[arg(long)]
     stay: bool,
     /// Longest wait for the first observation, in seconds; 0 waits for ever
-    #[arg(long, value_name = "SECONDS", default_value_t = 60.0, value_parser = seconds)]
+    #[arg(long, value_name = "SECONDS", default_value_t = 60.0, value_parser = super::seconds)]
     timeout: f64,
     /// Samples latents and actions instead of taking the most probable
     #[arg(long)]
@@ -50,24 +56,15 @@ pub(super) struct RunArguments {
     /// Seed of --sample
     #[arg(long, value_name = "SEED", default_value_t = 0)]
     seed: u64,
-    /// What is sent when the policy has nothing fit to send
-    #[arg(long, value_enum, default_value = "hold")]
-    fallback: Fallback,
-    /// How long a wait polls before it blocks, in microseconds
-    #[arg(long, value_name = "US", default_value_t = 50)]
-    spin_us: u64,
     #[command(flatten)]
     observers: ObserverArguments,
     /// Writes the summary to this file as JSON
     #[arg(long, value_name = "FILE")]
     json: Option<PathBuf>,
-}
-
-fn seconds(text: &str) -> Result<f64, String> {
-    match text.parse::<f64>() {
-        Ok(value) if (0.0..=1e6).contains(&value) => Ok(value),
-        _ => Err("expected seconds, 0 to 1000000".into()),
-    }
+    #[command(flatten)]
+    safety: SafetyArguments,
+    #[command(flatten)]
+    time: TimeArguments,
 }
 
 pub(super) fn run(arguments: &RunArguments) -> anyhow::Result<()> {
@@ -79,11 +76,22 @@ pub(super) fn run(arguments: &RunArguments) -> anyhow::Result<()> {
         false => Sampling::Mode,
     };
     let policy = Policy::new(&bundle, engine, sampling)?;
-    let mut observers =
-        Observers::start(&arguments.observers, &arguments.instance, &bundle, &policy, engine, sampling)?;
-    let mut controller = Controller::open(policy, arguments.controller_settings())?;
-    let result = control(&mut controller, arguments, &mut observers, &stop);
-    let mut report = controller.report(arguments.engine, *result.as_ref().unwrap_or(&Ended::Failed));
+    let settings = arguments.controller_settings();
+    let log = LogSettings {
+        fallback: settings.fallback,
+        rate_max: settings.rate_max,
+        ..LogSettings::new(&arguments.instance, engine, sampling)
+    };
+    let mut observers = Observers::start(&arguments.observers, &bundle, &policy, log)?;
+    let mut controller = Controller::open(policy, settings)?;
+    let mut status = StatusLine::start(&arguments.instance).context("starting the status line")?;
+    // Asked for last: the other threads stay ordinary ones.
+    let granted = arguments.time.ask()?;
+    let result = control(&mut controller, &mut status, &mut observers, &stop);
+    drop(status);
+    let ended = result.as_ref().map_or_else(Ended::from, |ended| *ended);
+    let mut report = controller.report(arguments.engine, ended);
+    report.realtime = granted;
     let telemetry = controller.telemetry().clone();
     // The simulator is told before anything slow is done.
     let closed = controller.close();
@@ -93,33 +101,31 @@ pub(super) fn run(arguments: &RunArguments) -> anyhow::Result<()> {
         print!("{}", report.summary());
         super::write_json(arguments.json.as_ref(), &report)?;
     }
-    result?;
-    print!("{}", left?.lines());
+    print!("{}", left.as_ref().map(Left::lines).unwrap_or_default());
     print!("{}", arguments.observers.write_latencies(&telemetry, &report)?);
+    result?;
+    left?;
     Ok(closed?)
 }
 
 impl RunArguments {
     fn controller_settings(&self) -> ControllerSettings {
-        let spin = Duration::from_micros(self.spin_us);
         ControllerSettings {
-            link: LinkSettings { spin, ..LinkSettings::new(&self.instance) },
             episodes_max: self.episodes,
             stay: self.stay,
             first_timeout: (self.timeout > 0.0).then(|| Duration::from_secs_f64(self.timeout)),
-            fallback: self.fallback,
+            ..self.safety.settings(&self.instance, &self.time)
         }
     }
 }
 
 fn control(
     controller: &mut Controller,
-    arguments: &RunArguments,
+    status: &mut StatusLine,
     observers: &mut Observers,
     stop: &AtomicBool,
-) -> anyhow::Result<Ended> {
-    let mut status = StatusLine::start(&arguments.instance).context("starting the status line")?;
-    let mut all: Vec<&mut dyn TickObserver> = vec![&mut status];
+) -> Result<Ended, ControllerError> {
+    let mut all: Vec<&mut dyn TickObserver> = vec![status];
     all.extend(observers.all());
-    Ok(controller.run(stop, &mut all)?)
+    controller.run(stop, &mut all)
 }

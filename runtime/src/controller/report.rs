@@ -6,8 +6,9 @@ use rcwm_models::bundle::Manifest;
 use rcwm_models::tasks::task_name;
 use rcwm_models::wire::{Observation, ObservationFlags};
 
-use super::{Arrival, Ended};
+use super::{Arrival, Ended, State, SurpriseReport};
 use crate::EngineKind;
+use crate::realtime::Granted;
 use crate::telemetry::{Latency, table};
 
 /// Everything that is counted.
@@ -21,9 +22,13 @@ pub struct Counters {
     pub fallback_answers: u64,
     /// Observations that had been answered before and got the same answer again.
     pub repeated_observations: u64,
-    /// Observations older than the last, dropped.
+    /// Answers to ticks whose observation had not come, on what the world model imagined.
+    pub imagined_answers: u64,
+    /// Observations older than the last, or scheduled too long ago, dropped.
     pub stale_observations: u64,
-    /// Observations that were published but never seen (real time: overwritten by a later one).
+    /// Observations that came after their tick had been imagined; the state went back for them.
+    pub late_observations: u64,
+    /// Observations that were published but never seen (real time: overwritten by a later one, or lost).
     pub missed_observations: u64,
     /// Observations refused because they held numbers that are not finite.
     pub refused_observations: u64,
@@ -31,12 +36,28 @@ pub struct Counters {
     pub non_finite_outputs: u64,
     /// Ticks on which the engine failed.
     pub engine_errors: u64,
-    /// Actions published later than a period after their observation was due (real time).
+    /// Ticks after which the robot branch was more surprised than allowed.
+    pub robot_surprises: u64,
+    /// The same of the environment branch.
+    pub environment_surprises: u64,
+    /// Ticks whose work ahead was for another action than was executed, and was done again.
+    pub recomputed: u64,
+    /// Actions that the rate limit has changed.
+    pub rate_limited: u64,
+    /// Answers that were not sent because a newer observation had come before they were ready.
+    pub overtaken_answers: u64,
+    /// Ticks without an observation that were slept through and not made up for.
+    pub skipped_ticks: u64,
+    /// Observations published later than a period after they were due: the simulator's own lateness (real time).
+    pub published_late: u64,
+    /// Actions published later than a period after their observation was due, or never (real time).
     pub missed_deadlines: u64,
     /// Those of them that were answered within a period: the simulator itself had published late.
     pub missed_deadlines_published_late: u64,
     /// Another simulator took over the instance.
     pub peer_restarts: u64,
+    /// A peer was silent for so long that the controller fell silent too.
+    pub peers_lost: u64,
 }
 
 impl Counters {
@@ -147,8 +168,14 @@ pub struct RunReport {
     pub successes: usize,
     /// Mean return of the whole episodes.
     pub return_mean: Option<f64>,
+    /// What the controller was up to in the end.
+    pub last_state: State,
     /// Counts.
     pub counters: Counters,
+    /// How surprised the branches were; none without a tick that tells.
+    pub surprise: Option<SurpriseReport>,
+    /// What the system granted the loop's thread.
+    pub realtime: Option<Granted>,
     /// Frames that were not recorded because the recorder could not keep up.
     pub frames_dropped: u64,
     /// Percentiles per stage.
@@ -179,16 +206,14 @@ impl RunReport {
             whole_episodes: whole.len(),
             successes: whole.iter().filter(|episode| episode.success).count(),
             return_mean: (!whole.is_empty()).then(|| sum / whole.len() as f64),
+            last_state: State::Waiting,
             counters: *counters,
+            surprise: None,
+            realtime: None,
             frames_dropped: 0,
             latency: Vec::new(),
             episodes,
         }
-    }
-
-    pub(super) fn with_latencies(mut self, latency: Vec<Latency>) -> Self {
-        self.latency = latency;
-        self
     }
 
     /// The summary for people.
@@ -228,25 +253,62 @@ impl RunReport {
     fn counter_lines(&self) -> String {
         let c = &self.counters;
         let mut text = format!(
-            "counts     observations {}, answers {}, repeated {}, stale {}, missed observations {}, missed deadlines {} ({} \
-             of them published late), peer restarts {}\n",
+            "counts     observations {}, answers {}, repeated {}, stale {}, missed observations {}, recomputed {}, peer \
+             restarts {}, peers lost {}\n",
             c.observations,
             c.answers,
             c.repeated_observations,
             c.stale_observations,
             c.missed_observations,
-            c.missed_deadlines,
-            c.missed_deadlines_published_late,
-            c.peer_restarts
+            c.recomputed,
+            c.peer_restarts,
+            c.peers_lost
         );
         text += &format!(
-            "safety     fallback answers {}, non-finite outputs {}, refused observations {}, engine errors {}\n",
-            c.fallback_answers, c.non_finite_outputs, c.refused_observations, c.engine_errors
+            "time       missed deadlines {} ({} of them published late), observations published late {}, overtaken {}, \
+             skipped {}\n",
+            c.missed_deadlines,
+            c.missed_deadlines_published_late,
+            c.published_late,
+            c.overtaken_answers,
+            c.skipped_ticks
         );
+        text += &format!(
+            "safety     fallback answers {}, imagined {} (seen after all {}), non-finite outputs {}, refused observations {}, \
+             engine errors {}, rate-limited {}\n",
+            c.fallback_answers,
+            c.imagined_answers,
+            c.late_observations,
+            c.non_finite_outputs,
+            c.refused_observations,
+            c.engine_errors,
+            c.rate_limited
+        );
+        text += &self.surprise_line();
+        for line in self.realtime.iter().flat_map(Granted::lines) {
+            text += &format!("realtime   {line}\n");
+        }
         if self.frames_dropped > 0 {
             text += &format!("recording  {} frames dropped\n", self.frames_dropped);
         }
         text
+    }
+
+    fn surprise_line(&self) -> String {
+        let Some(SurpriseReport { robot, environment, .. }) = self.surprise else { return String::new() };
+        let c = &self.counters;
+        format!(
+            "surprise   robot p50 {:.2} p99 {:.2} max {:.2} nats ({} over), environment p50 {:.2} p99 {:.2} max {:.2} nats ({} \
+             over)\n",
+            robot.p50_nats,
+            robot.p99_nats,
+            robot.max_nats,
+            c.robot_surprises,
+            environment.p50_nats,
+            environment.p99_nats,
+            environment.max_nats,
+            c.environment_surprises
+        )
     }
 }
 

@@ -1,10 +1,11 @@
 //! The times that a log holds.
 
+use rcwm_models::wire::ObservationFlags;
 use serde::Serialize;
 
 use super::LogError;
 use super::reader::{Entry, LogReader};
-use super::record::{LoggedOutcome, TickRecord};
+use super::record::{LoggedOutcome, Observed, TickRecord};
 use crate::telemetry::{Latency, Stage, Telemetry, table};
 
 /// Times of a logged run.
@@ -25,7 +26,9 @@ pub struct LoggedLatencyReport {
     /// The control period, in us; none in lock-step.
     pub period_us: Option<f64>,
     /// Answers published later than a period after their observation was due.
-    pub missed_deadlines: u64,
+    pub late_answers: u64,
+    /// Answers that were not sent because a newer observation had come before they were ready.
+    pub overtaken: u64,
     /// Where the log is damaged; all before it was read.
     pub log_damage: Option<String>,
     /// Percentiles per stage.
@@ -42,7 +45,8 @@ impl LoggedLatencies {
             ticks: 0,
             ticks_dropped: 0,
             period_us: None,
-            missed_deadlines: 0,
+            late_answers: 0,
+            overtaken: 0,
             log_damage: None,
             latency: Vec::new(),
         };
@@ -70,33 +74,51 @@ impl LoggedLatencies {
         self.report.ticks += 1;
         self.report.ticks_dropped += record.dropped_before;
         for call in &record.calls {
-            if let LoggedOutcome::Decided { stage_ns, .. } = &call.outcome {
-                for (stage, time_ns) in Stage::POLICY.into_iter().zip(stage_ns) {
-                    self.telemetry.record(stage, *time_ns);
+            match &call.outcome {
+                LoggedOutcome::Decided { stage_ns, .. } => {
+                    for (stage, time_ns) in Stage::POLICY.into_iter().zip(stage_ns) {
+                        self.telemetry.record(stage, *time_ns);
+                    }
                 }
+                LoggedOutcome::Done(time_ns) => self.telemetry.record(Stage::Ahead, *time_ns),
+                _ => {}
             }
         }
-        let Some(observed) = &record.observed else { return };
-        let (received_ns, sent_ns) = (record.received_ns, record.answer.published_ns);
-        self.telemetry.record(Stage::Receive, received_ns.saturating_sub(observed.published_ns));
+        if record.overtaken {
+            self.report.overtaken += 1;
+            return;
+        }
+        let TickRecord { scheduled_ns, received_ns, .. } = *record;
+        let sent_ns = record.answer.published_ns;
+        let from_schedule_ns = sent_ns.saturating_sub(scheduled_ns);
+        let Some(observed) = &record.observed else {
+            self.telemetry.record(Stage::Imagine, sent_ns.saturating_sub(received_ns));
+            self.telemetry.record(Stage::FromSchedule, from_schedule_ns);
+            return;
+        };
+        let Observed { published_ns, period_ns, .. } = *observed;
+        self.telemetry.record(Stage::Receive, received_ns.saturating_sub(published_ns));
         self.telemetry.record(Stage::Tick, sent_ns.saturating_sub(received_ns));
-        self.telemetry.record(Stage::EndToEnd, sent_ns.saturating_sub(observed.published_ns));
-        let period_ns = observed.period_ns;
-        if period_ns > 0 {
+        self.telemetry.record(Stage::EndToEnd, sent_ns.saturating_sub(published_ns));
+        // One that was sent again for us is older than we are.
+        if period_ns > 0 && !ObservationFlags(observed.flags).contains(ObservationFlags::REPEATED) {
             self.report.period_us = Some(period_ns as f64 / 1e3);
-            let due_ns = observed.scheduled_ns.saturating_add(period_ns);
-            self.report.missed_deadlines += u64::from(sent_ns > due_ns);
+            self.telemetry.record(Stage::PublishLag, published_ns.saturating_sub(scheduled_ns));
+            self.telemetry.record(Stage::FromSchedule, from_schedule_ns);
+            self.report.late_answers += u64::from(from_schedule_ns > period_ns);
         }
     }
 
     /// The summary for people.
     #[must_use]
     pub fn text(&self) -> String {
-        let LoggedLatencyReport { ticks, ticks_dropped, period_us, missed_deadlines, latency, .. } =
+        let LoggedLatencyReport { ticks, ticks_dropped, period_us, late_answers, overtaken, latency, .. } =
             &self.report;
         let pace = match period_us {
             Some(period_us) => {
-                format!("real time, a period of {period_us:.1} us, {missed_deadlines} deadlines missed")
+                format!(
+                    "real time, a period of {period_us:.1} us, {late_answers} answers late, {overtaken} overtaken"
+                )
             }
             None => "lock-step".to_owned(),
         };

@@ -13,7 +13,7 @@ use rcwm_models::wire::{Action, Observation};
 use super::LogError;
 use super::record::{BundleIdentity, Header, Machine};
 use super::worker::Worker;
-use crate::controller::{Tick, TickObserver};
+use crate::controller::{Fallback, Tick, TickObserver, TickTimes};
 use crate::engine::EngineSettings;
 use crate::policy::{CALLS_MAX, Call, Policy, STAGES, Sampling, State};
 
@@ -26,6 +26,10 @@ pub struct LogSettings {
     pub engine: EngineSettings,
     /// How latents and actions are chosen.
     pub sampling: Sampling,
+    /// What is sent where the policy has nothing fit to send.
+    pub fallback: Fallback,
+    /// Largest change of an action's component from one action to the next.
+    pub rate_max: Option<f32>,
     /// Ticks that may wait for the writer.
     pub pool_ticks: usize,
 }
@@ -34,10 +38,18 @@ impl LogSettings {
     /// Ticks that may wait for the writer unless told otherwise: half a second at 1 kHz, about 13 MB.
     pub const POOL_TICKS: usize = 512;
 
-    /// With [`Self::POOL_TICKS`].
+    /// Of a controller that holds the last action and limits no rate.
     #[must_use]
     pub fn new(instance: &str, engine: EngineSettings, sampling: Sampling) -> Self {
-        Self { instance: instance.to_owned(), engine, sampling, pool_ticks: Self::POOL_TICKS }
+        let (fallback, rate_max) = (Fallback::Hold, None);
+        Self {
+            instance: instance.to_owned(),
+            engine,
+            sampling,
+            fallback,
+            rate_max,
+            pool_ticks: Self::POOL_TICKS,
+        }
     }
 }
 
@@ -57,8 +69,10 @@ pub struct LogSummary {
 /// A tick on its way to the writer. Its buffers are used again and again.
 pub(super) struct Slot {
     pub(super) observation: Observation,
+    pub(super) observed: bool,
     pub(super) is_first: bool,
-    pub(super) received_ns: u64,
+    pub(super) overtaken: bool,
+    pub(super) times: TickTimes,
     pub(super) answer: Action,
     pub(super) calls: Vec<Call>,
     pub(super) resumes: bool,
@@ -73,8 +87,10 @@ impl Slot {
         let answer = Action { answers: 0, published_ns: 0, source: 0, reserved: 0, action: [0.0; 4] };
         Self {
             observation: Observation::zeroed(),
+            observed: false,
             is_first: false,
-            received_ns: 0,
+            overtaken: false,
+            times: TickTimes { scheduled_ns: 0, published_ns: 0, received_ns: 0, sent_ns: 0 },
             answer,
             calls: Vec::with_capacity(CALLS_MAX),
             resumes: false,
@@ -166,8 +182,12 @@ impl Logger {
             (self.policy, self.calls_seen) = (policy.number(), 0);
         }
         slot.other_bundle = exchanged.then(|| BundleIdentity::of(policy.manifest()));
-        slot.observation.clone_from(tick.observation);
-        (slot.is_first, slot.received_ns, slot.answer) = (tick.is_first, tick.received_ns, tick.answer);
+        slot.observed = tick.observation.is_some();
+        if let Some(observation) = tick.observation {
+            slot.observation.clone_from(observation);
+        }
+        (slot.is_first, slot.overtaken, slot.times) = (tick.is_first, tick.overtaken, tick.times);
+        slot.answer = tick.answer;
         slot.calls.clear();
         slot.calls.extend(policy.calls_since(self.calls_seen).copied());
         let forgotten = policy.calls_made() - self.calls_seen > slot.calls.len() as u64;
@@ -184,7 +204,8 @@ impl TickObserver for Logger {
         if self.full.is_none() {
             return;
         }
-        let Some(mut slot) = self.take_slot(tick.observation.period_ns == 0) else {
+        let lockstep = tick.observation.is_some_and(|observation| observation.period_ns == 0);
+        let Some(mut slot) = self.take_slot(lockstep) else {
             self.dropped_since += 1;
             self.dropped.fetch_add(1, Ordering::Relaxed);
             return;
@@ -208,6 +229,8 @@ fn header(policy: &Policy, settings: LogSettings) -> Header {
         bundle: BundleIdentity::of(policy.manifest()),
         engine: settings.engine,
         sampling: settings.sampling,
+        fallback: settings.fallback,
+        rate_max: settings.rate_max,
         stages: STAGES.iter().map(ToString::to_string).collect(),
         machine: Machine::here(),
     }

@@ -27,7 +27,9 @@ pub use episodes::{WrittenEpisodes, write_episodes};
 pub use latencies::{LoggedLatencies, LoggedLatencyReport};
 pub use logger::{LogSettings, LogSummary, Logger};
 pub use reader::{Entry, LogReader, LoggedTick};
-pub use record::{BundleIdentity, Header, KEYFRAME_TICKS, LoggedCall, Machine, Record, TickRecord};
+pub use record::{
+    BundleIdentity, Header, KEYFRAME_TICKS, LoggedCall, LoggedOutcome, Machine, Record, TickRecord,
+};
 pub use replay::{Difference, ReplayReport, Replayer};
 
 use std::path::PathBuf;

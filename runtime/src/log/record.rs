@@ -8,6 +8,7 @@ use serde::{Deserialize, Serialize};
 use sha2::{Digest, Sha256};
 
 use super::pack::{PackedImage, PackedMask};
+use crate::controller::Fallback;
 use crate::engine::EngineSettings;
 use crate::policy::{BranchState, CallKind, Sampling, State, Surprise};
 
@@ -33,6 +34,10 @@ pub struct Header {
     pub engine: EngineSettings,
     /// How latents and actions were chosen, and the seed.
     pub sampling: Sampling,
+    /// What was sent where the policy had nothing fit to send.
+    pub fallback: Fallback,
+    /// Largest change of an action's component from one action to the next.
+    pub rate_max: Option<f32>,
     /// Names of the stages of a tick whose times each record holds, in order.
     pub stages: Vec<String>,
     /// The machine: other processors may round otherwise.
@@ -140,8 +145,12 @@ pub struct TickRecord {
     pub is_first: bool,
     /// What was observed; none where nothing came.
     pub observed: Option<Observed>,
-    /// When it was received, in ns of the monotonic clock.
+    /// When the observation was due, in ns of the monotonic clock.
+    pub scheduled_ns: u64,
+    /// When it was received, or found overdue.
     pub received_ns: u64,
+    /// The answer was not sent: a newer observation had come before it was ready.
+    pub overtaken: bool,
     /// What the policy was asked since the last tick, and how it went.
     pub calls: Vec<LoggedCall>,
     /// What was sent.
@@ -256,8 +265,8 @@ pub struct LoggedCall {
 /// How a call ended.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 pub enum LoggedOutcome {
-    /// Work ahead was done.
-    Done,
+    /// Work ahead was done, in so many ns.
+    Done(u64),
     /// The policy went back to an earlier state, the one with this checksum.
     StateSet(u32),
     /// A decision was made.

@@ -12,6 +12,7 @@ use serde::Serialize;
 use super::LogError;
 use super::reader::{Entry, LogReader, LoggedTick};
 use super::record::{BundleIdentity, Header, LoggedCall, LoggedOutcome, TickRecord, WholeState, digest};
+use crate::controller::Gate;
 use crate::engine::EngineSettings;
 use crate::policy::{CallKind, CallOutcome, Policy, State};
 use crate::telemetry::{Latency, Stage, Telemetry, table};
@@ -76,6 +77,11 @@ pub struct Replayer {
     telemetry: Telemetry,
     report: ReplayReport,
     resumed: bool,
+    gate: Gate,
+    /// What the gate let through last is in the log.
+    last_sent_known: bool,
+    /// What the policy decided last in this tick.
+    decided: Option<[f32; ACTION_LEN]>,
     /// The last states, by their checksums: the controller may go back to one of them.
     states: VecDeque<(u32, State)>,
 }
@@ -103,7 +109,18 @@ impl Replayer {
         let policy = load(&bundles, &header.bundle, header, engine)?;
         let report = ReplayReport::new(header.clone(), engine);
         let states = VecDeque::with_capacity(STATES_MAX);
-        Ok(Self { engine, bundles, policy, telemetry: Telemetry::new(), report, resumed: false, states })
+        Ok(Self {
+            engine,
+            bundles,
+            gate: Gate::new(policy.limits(), header.rate_max),
+            policy,
+            telemetry: Telemetry::new(),
+            report,
+            resumed: false,
+            last_sent_known: true,
+            decided: None,
+            states,
+        })
     }
 
     /// Replays the whole log; `go_on` is asked after every entry with the bytes read and in all.
@@ -144,6 +161,9 @@ impl Replayer {
     fn exchange(&mut self, identity: &BundleIdentity) -> Result<(), LogError> {
         self.policy = load(&self.bundles, identity, &self.report.log, self.engine)?;
         self.states.clear();
+        let last = self.gate.last();
+        self.gate = Gate::new(self.policy.limits(), self.report.log.rate_max);
+        last.into_iter().for_each(|last| self.gate.sent(last));
         self.report.swaps += 1;
         Ok(())
     }
@@ -160,7 +180,9 @@ impl Replayer {
             return;
         }
         self.report.ticks_compared += 1;
-        let difference = self.calls(tick).or_else(|| self.state(record)).or_else(|| answer(record));
+        let difference = self.calls(tick);
+        let answer = self.answer(record);
+        let difference = difference.or_else(|| self.state(record)).or(answer);
         self.resumed = false;
         self.differs(tick, difference);
     }
@@ -180,8 +202,9 @@ impl Replayer {
             self.policy.set_noise_position(noise_position);
             self.policy.set_state(&state).is_ok()
         });
-        self.resumed = true;
+        (self.resumed, self.last_sent_known) = (true, false);
         self.states.clear();
+        self.sent(&tick.record);
         if !taken {
             let what = "the state after dropped ticks".to_owned();
             self.differs(tick, Some([what, "missing, or of another size".into(), "the model's size".into()]));
@@ -191,6 +214,7 @@ impl Replayer {
     /// Makes the calls of a tick and gives the first difference.
     fn calls(&mut self, tick: &LoggedTick) -> Option<[String; 3]> {
         let mut first = None;
+        self.decided = None;
         let start = Instant::now();
         let mut answered = false;
         for call in &tick.record.calls {
@@ -203,6 +227,9 @@ impl Replayer {
                 ]);
             };
             answered |= matches!(call.kind, CallKind::Observe | CallKind::Imagine);
+            if let LoggedOutcome::Decided { action, .. } = &replayed {
+                self.decided = Some(*action);
+            }
             let difference = self.compare(&call.outcome, &replayed);
             first = first.or(difference);
         }
@@ -228,11 +255,15 @@ impl Replayer {
         }
         let outcome = self.policy.calls_since(made).next()?.outcome;
         self.report.calls += 1;
-        if let CallOutcome::Decided { recomputed, stage_ns, .. } = &outcome {
-            self.report.recomputed += u64::from(*recomputed);
-            for (stage, time_ns) in Stage::POLICY.into_iter().zip(stage_ns) {
-                self.telemetry.record(stage, *time_ns);
+        match &outcome {
+            CallOutcome::Decided { recomputed, stage_ns, .. } => {
+                self.report.recomputed += u64::from(*recomputed);
+                for (stage, time_ns) in Stage::POLICY.into_iter().zip(stage_ns) {
+                    self.telemetry.record(stage, *time_ns);
+                }
             }
+            CallOutcome::Done { time_ns } => self.telemetry.record(Stage::Ahead, *time_ns),
+            _ => {}
         }
         Some(outcome.into())
     }
@@ -261,14 +292,15 @@ impl Replayer {
     }
 
     fn compare(&mut self, logged: &LoggedOutcome, replayed: &LoggedOutcome) -> Option<[String; 3]> {
-        use LoggedOutcome::{Decided, Failed};
+        use LoggedOutcome::{Decided, Done, Failed};
         let (
             Decided { action, recomputed, surprise, .. },
             Decided { action: a, recomputed: r, surprise: s, .. },
         ) = (logged, replayed)
         else {
             self.report.failures += u64::from(matches!(logged, Failed(_)));
-            return (logged != replayed)
+            let ahead = matches!((logged, replayed), (Done(_), Done(_)));
+            return (!ahead && logged != replayed)
                 .then(|| ["the policy's outcome".into(), said(logged), said(replayed)]);
         };
         for (logged, replayed) in action.iter().zip(a) {
@@ -288,6 +320,35 @@ impl Replayer {
             .then(|| ["whether work ahead was done again".into(), recomputed.to_string(), r.to_string()])
     }
 
+    /// What was sent: the policy's action, or the fallback, through the gate.
+    fn answer(&mut self, record: &TickRecord) -> Option<[String; 3]> {
+        let (header, logged) = (&self.report.log, record.answer.action);
+        if record.is_first {
+            self.gate.start_episode();
+            self.last_sent_known = true;
+        }
+        let of_policy = [ActionSource::Policy as u32, ActionSource::Imagined as u32];
+        let action = if of_policy.contains(&record.answer.source) {
+            self.decided
+        } else {
+            Some(header.fallback.action(self.gate.last()))
+        };
+        // An answer that was overtaken has not passed the gate: it was not sent.
+        let replayed =
+            if record.overtaken { action } else { action.map(|action| self.gate.pass(action).action) };
+        let known = self.last_sent_known;
+        self.sent(record);
+        let same = replayed.is_some_and(|replayed| replayed.map(f32::to_bits) == logged.map(f32::to_bits));
+        (known && !same).then(|| ["the action sent".into(), format!("{logged:?}"), format!("{replayed:?}")])
+    }
+
+    fn sent(&mut self, record: &TickRecord) {
+        if !record.overtaken {
+            self.gate.sent(record.answer.action);
+            self.last_sent_known = true;
+        }
+    }
+
     fn state(&self, record: &TickRecord) -> Option<[String; 3]> {
         let replayed = digest(self.policy.state());
         let hex = |bytes: [u8; 16]| format!("{:032x}", u128::from_be_bytes(bytes));
@@ -295,24 +356,9 @@ impl Replayer {
     }
 }
 
-/// What was sent must be what the policy decided, where it says so.
-fn answer(record: &TickRecord) -> Option<[String; 3]> {
-    let policy = [ActionSource::Policy as u32, ActionSource::Imagined as u32];
-    if !policy.contains(&record.answer.source) {
-        return None;
-    }
-    let decided: Option<[f32; ACTION_LEN]> = record.calls.iter().rev().find_map(|call| match &call.outcome {
-        LoggedOutcome::Decided { action, .. } => Some(*action),
-        _ => None,
-    });
-    let sent = record.answer.action;
-    let same = decided.is_some_and(|decided| decided.map(f32::to_bits) == sent.map(f32::to_bits));
-    (!same).then(|| ["the action sent".into(), format!("{sent:?}"), format!("{decided:?}")])
-}
-
 fn said(outcome: &LoggedOutcome) -> String {
     match outcome {
-        LoggedOutcome::Done => "work ahead was done".into(),
+        LoggedOutcome::Done(_) => "work ahead was done".into(),
         LoggedOutcome::StateSet(checksum) => format!("went back to the state {checksum:08x}"),
         LoggedOutcome::Decided { action, .. } => format!("decided {action:?}"),
         LoggedOutcome::Failed(reason) => reason.clone(),

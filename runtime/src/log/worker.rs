@@ -7,7 +7,7 @@ use std::sync::atomic::{AtomicU64, Ordering};
 use std::sync::mpsc::{Receiver, RecvTimeoutError, SyncSender};
 use std::time::Duration;
 
-use rcwm_models::wire::ObservationFlags;
+use rcwm_models::wire::{Observation, ObservationFlags};
 
 use super::LogError;
 use super::frames::{MAGIC, write_frame, write_start};
@@ -79,16 +79,15 @@ impl Worker {
             self.record(&Record::Policy(bundle.clone()))?;
         }
         let keyframe = self.ticks.is_multiple_of(KEYFRAME_TICKS) || slot.resumes;
-        let observation = &slot.observation;
-        let image = self.images.pack(&observation.image, keyframe);
-        let masked = observation.is(ObservationFlags::MASK_VALID);
-        let mask = masked.then(|| PackedMask::pack(&observation.robot_mask));
+        let observed = slot.observed.then(|| self.observed(&slot.observation, keyframe));
         let record = TickRecord {
             dropped_before: slot.dropped_before,
             resumes: slot.resumes,
             is_first: slot.is_first,
-            observed: Some(Observed::of(observation, image, mask)),
-            received_ns: slot.received_ns,
+            observed,
+            scheduled_ns: slot.times.scheduled_ns,
+            received_ns: slot.times.received_ns,
+            overtaken: slot.overtaken,
             calls: slot.calls.iter().map(LoggedCall::from).collect(),
             answer: slot.answer.into(),
             digest: digest(&slot.state),
@@ -97,6 +96,12 @@ impl Worker {
         self.record(&Record::Tick(Box::new(record)))?;
         self.ticks += 1;
         Ok(())
+    }
+
+    fn observed(&mut self, observation: &Observation, keyframe: bool) -> Observed {
+        let image = self.images.pack(&observation.image, keyframe);
+        let masked = observation.is(ObservationFlags::MASK_VALID);
+        Observed::of(observation, image, masked.then(|| PackedMask::pack(&observation.robot_mask)))
     }
 
     fn record(&mut self, record: &Record) -> Result<(), LogError> {
@@ -128,7 +133,7 @@ impl From<&Call> for LoggedCall {
 impl From<CallOutcome> for LoggedOutcome {
     fn from(outcome: CallOutcome) -> Self {
         match outcome {
-            CallOutcome::Done => Self::Done,
+            CallOutcome::Done { time_ns } => Self::Done(time_ns),
             CallOutcome::StateSet { checksum } => Self::StateSet(checksum),
             CallOutcome::Decided { action, recomputed, surprise, stage_ns } => {
                 Self::Decided { action, recomputed, surprise, stage_ns: stage_ns.to_vec() }

@@ -28,7 +28,10 @@ pub enum CallKind {
 #[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
 pub enum CallOutcome {
     /// Work ahead was done.
-    Done,
+    Done {
+        /// How long it took, in ns.
+        time_ns: u64,
+    },
     /// The state with this checksum was taken over.
     StateSet {
         /// See [`super::State::checksum`].
@@ -81,13 +84,11 @@ impl From<&Result<Decision, PolicyError>> for CallOutcome {
     }
 }
 
-impl From<&Result<(), PolicyError>> for CallOutcome {
-    fn from(result: &Result<(), PolicyError>) -> Self {
-        result.as_ref().map_or_else(Self::failed, |()| Self::Done)
-    }
-}
-
 impl CallOutcome {
+    pub(super) fn of_work_ahead(result: &Result<(), PolicyError>, time_ns: u64) -> Self {
+        result.as_ref().map_or_else(Self::failed, |()| Self::Done { time_ns })
+    }
+
     fn failed(error: &PolicyError) -> Self {
         match error {
             PolicyError::NotFinite { part, .. } => Self::NotFinite { part: *part },
@@ -108,7 +109,7 @@ pub(super) struct CallRing {
 impl CallRing {
     pub(super) fn new() -> Self {
         static POLICIES: AtomicU64 = AtomicU64::new(0);
-        let none = Call { kind: CallKind::WorkAhead, action: None, outcome: CallOutcome::Done };
+        let none = Call { kind: CallKind::WorkAhead, action: None, outcome: CallOutcome::Refused };
         Self {
             policy: POLICIES.fetch_add(1, Ordering::Relaxed),
             calls: vec![none; CALLS_MAX].into(),

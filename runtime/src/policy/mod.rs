@@ -25,6 +25,7 @@ pub use parts::{BranchBuffers, Buffers};
 pub use state::{BranchState, State};
 
 use std::path::Path;
+use std::time::Instant;
 
 use rcwm_models::bundle::{Bundle, BundleError, Manifest, PartName};
 use rcwm_models::{ACTION_LEN, IMAGE_BYTES};
@@ -209,8 +210,10 @@ impl Policy {
     /// # Errors
     /// As [`Self::observe`].
     pub fn work_ahead(&mut self, action: Option<&[f32; ACTION_LEN]>) -> Result<(), PolicyError> {
+        let start = Instant::now();
         let result = self.work_ahead_unnoted(action);
-        self.calls.note(CallKind::WorkAhead, action, (&result).into());
+        let outcome = CallOutcome::of_work_ahead(&result, start.elapsed().as_nanos() as u64);
+        self.calls.note(CallKind::WorkAhead, action, outcome);
         result
     }
 

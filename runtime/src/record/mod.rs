@@ -180,6 +180,8 @@ impl Recorder {
 
 impl TickObserver for Recorder {
     fn ticked(&mut self, tick: &Tick<'_>) {
+        // A tick without an observation has nothing to show.
+        let Some(observation) = tick.observation else { return };
         if tick.is_first {
             if self.episodes_left == 0 {
                 self.queue = None;
@@ -190,7 +192,7 @@ impl TickObserver for Recorder {
             return;
         }
         self.send(Box::new(Frame {
-            observation: *tick.observation,
+            observation: *observation,
             state: tick.policy.state().clone(),
             answer: tick.answer,
             is_first: tick.is_first,

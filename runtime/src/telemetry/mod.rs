@@ -34,6 +34,8 @@ const TIME_NS_MAX: u64 = 60_000_000_000;
 #[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord, Hash, Serialize)]
 #[serde(rename_all = "snake_case")]
 pub enum Stage {
+    /// Observation scheduled -> published: the simulator's own lateness (real time).
+    PublishLag,
     /// Observation published -> received.
     Receive,
     /// Shared encoder.
@@ -50,11 +52,18 @@ pub enum Stage {
     Tick,
     /// Observation published -> action published.
     EndToEnd,
+    /// Observation scheduled -> action published, ticks without an observation or an answer included (real time).
+    FromSchedule,
+    /// A tick without an observation: found overdue -> action published.
+    Imagine,
+    /// Work ahead, in the idle time after an action was sent.
+    Ahead,
 }
 
 impl Stage {
     /// All stages, in the order of a tick.
-    pub const ALL: [Self; 8] = [
+    pub const ALL: [Self; 12] = [
+        Self::PublishLag,
         Self::Receive,
         Self::Encoder,
         Self::Robot,
@@ -63,6 +72,9 @@ impl Stage {
         Self::Actor,
         Self::Tick,
         Self::EndToEnd,
+        Self::FromSchedule,
+        Self::Imagine,
+        Self::Ahead,
     ];
 
     /// The stages of the policy, in the order of [`STAGES`].
@@ -73,6 +85,7 @@ impl Stage {
     #[must_use]
     pub const fn as_str(self) -> &'static str {
         match self {
+            Self::PublishLag => "publish_lag",
             Self::Receive => "receive",
             Self::Encoder => "encoder",
             Self::Robot => "robot",
@@ -81,6 +94,9 @@ impl Stage {
             Self::Actor => "actor",
             Self::Tick => "tick",
             Self::EndToEnd => "end_to_end",
+            Self::FromSchedule => "from_schedule",
+            Self::Imagine => "imagine",
+            Self::Ahead => "ahead",
         }
     }
 }
@@ -173,13 +189,13 @@ pub struct Latency {
 #[must_use]
 pub fn table(latencies: &[Latency]) -> String {
     let mut text = format!(
-        "  {:<12} {:>9} {:>10} {:>10} {:>10} {:>10}\n",
+        "  {:<13} {:>9} {:>10} {:>10} {:>10} {:>10}\n",
         "latency, us", "count", "p50", "p99", "p99.9", "max"
     );
     for row in latencies {
         let Latency { stage, count, p50_us, p99_us, p999_us, max_us } = row;
         text += &format!(
-            "  {:<12} {count:>9} {p50_us:>10.1} {p99_us:>10.1} {p999_us:>10.1} {max_us:>10.1}\n",
+            "  {:<13} {count:>9} {p50_us:>10.1} {p99_us:>10.1} {p999_us:>10.1} {max_us:>10.1}\n",
             stage.as_str()
         );
     }

@@ -16,7 +16,7 @@ use rcwm_models::onnx::{Graph, Model, Node, Tensor, data_type};
 use rcwm_models::wire::{
     Action, LinkSettings, Observation, ObservationFlags, SimulatorLink, Wait, forget_prefix,
 };
-use rcwm_runtime::controller::{Controller, ControllerSettings, Fallback, RunReport};
+use rcwm_runtime::controller::{Controller, ControllerError, ControllerSettings, Ended, Fallback, RunReport};
 use rcwm_runtime::record::{Recorded, Recorder};
 use rcwm_runtime::{EngineKind, EngineSettings, Policy};
 
@@ -130,6 +130,25 @@ pub fn start_controller(bundle: &Path, link: &OwnLink, fallback: Fallback) -> Jo
     })
 }
 
+/// The same with settings of its own; gives how it ended as well.
+pub fn start_controller_with(
+    bundle: &Path,
+    link: &OwnLink,
+    change: impl FnOnce(&mut ControllerSettings),
+) -> JoinHandle<(Result<Ended, ControllerError>, RunReport)> {
+    let policy = Policy::load(bundle, EngineSettings::tract()).unwrap();
+    let mut settings =
+        ControllerSettings { first_timeout: Some(NEVER), ..ControllerSettings::new(link.0.clone()) };
+    change(&mut settings);
+    std::thread::spawn(move || {
+        let mut controller = Controller::open(policy, settings).unwrap();
+        let ended = controller.run(&AtomicBool::new(false), &mut []);
+        let report =
+            controller.report(EngineKind::Tract, ended.as_ref().map_or_else(Ended::from, |ended| *ended));
+        (ended, report)
+    })
+}
+
 /// The same with a recorder into a folder; gives what was recorded.
 pub fn start_recording(bundle: &Path, link: &OwnLink, folder: &Path) -> JoinHandle<Recorded> {
     let checked = Bundle::open(bundle).unwrap();
@@ -156,9 +175,19 @@ pub fn start_with<T: Send + 'static>(
     fallback: Fallback,
     run: impl FnOnce(&mut Controller) -> T + Send + 'static,
 ) -> JoinHandle<T> {
-    let first_timeout = Some(NEVER);
-    let link = link.0.clone();
-    let settings = ControllerSettings { link, episodes_max: None, stay: false, first_timeout, fallback };
+    start_changed(policy, link, |settings| settings.fallback = fallback, run)
+}
+
+/// The same with changed settings.
+pub fn start_changed<T: Send + 'static>(
+    policy: Policy,
+    link: &OwnLink,
+    change: impl FnOnce(&mut ControllerSettings),
+    run: impl FnOnce(&mut Controller) -> T + Send + 'static,
+) -> JoinHandle<T> {
+    let mut settings =
+        ControllerSettings { first_timeout: Some(NEVER), ..ControllerSettings::new(link.0.clone()) };
+    change(&mut settings);
     std::thread::spawn(move || run(&mut Controller::open(policy, settings).unwrap()))
 }
 

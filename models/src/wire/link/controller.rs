@@ -53,7 +53,19 @@ impl ControllerLink {
     /// # Errors
     /// [`LinkError::Traffic`].
     pub fn wait_observation(&self, timeout: Duration) -> Result<Wait<ObservationSample>, LinkError> {
-        Ok(self.observations.wait(self.settings.spin, timeout)?.0)
+        self.wait_observation_polling(self.settings.spin, timeout)
+    }
+
+    /// The same with its own time of polling before it blocks.
+    ///
+    /// # Errors
+    /// [`LinkError::Traffic`].
+    pub fn wait_observation_polling(
+        &self,
+        spin: Duration,
+        timeout: Duration,
+    ) -> Result<Wait<ObservationSample>, LinkError> {
+        Ok(self.observations.wait(spin, timeout)?.0)
     }
 
     /// The newest observation, if one is waiting; never blocks.

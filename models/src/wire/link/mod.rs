@@ -16,7 +16,7 @@ use std::time::Duration;
 pub use controller::{ControllerLink, ObservationSample};
 pub use domain::{forget_prefix, list_leftovers};
 pub use error::LinkError;
-pub use observer::ObserverLink;
+pub use observer::{ActionObserverLink, ObserverLink};
 pub use simulator::{ObservationSlot, SimulatorLink};
 
 type Ipc = iceoryx2::prelude::ipc::Service;

@@ -7,7 +7,7 @@ use iceoryx2::prelude::Node;
 use super::direction::{Direction, Received, Receiver};
 use super::domain::make_node;
 use super::{Ipc, LinkError, LinkSettings, Wait};
-use crate::wire::Observation;
+use crate::wire::{Action, Observation};
 
 /// Receives observations without taking part: nobody waits for it, and it sees the newest only.
 pub struct ObserverLink {
@@ -35,5 +35,34 @@ impl ObserverLink {
     /// [`LinkError::Traffic`].
     pub fn wait_observation(&self, timeout: Duration) -> Result<Wait<Received<Observation>>, LinkError> {
         Ok(self.observations.wait(self.settings.spin, timeout)?.0)
+    }
+}
+
+/// Receives actions without taking part, for a monitor beside the simulator: the newest only.
+pub struct ActionObserverLink {
+    actions: Receiver<Action>,
+    // Dropped last: the port above belongs to it.
+    _node: Node<Ipc>,
+}
+
+impl ActionObserverLink {
+    /// Opens or creates the action service of an instance.
+    ///
+    /// # Errors
+    /// See [`LinkError`].
+    pub fn open(settings: &LinkSettings) -> Result<Self, LinkError> {
+        let node = make_node(settings)?;
+        let actions = Direction::<Action>::open(&node, &settings.instance, "action")?.receiver()?;
+        Ok(Self { actions, _node: node })
+    }
+
+    /// The newest action, if one is waiting; never blocks.
+    ///
+    /// # Errors
+    /// [`LinkError::Traffic`].
+    pub fn poll_action(&self) -> Result<Option<Action>, LinkError> {
+        // Signals are not looked at; they must not pile up.
+        self.actions.take_events()?;
+        Ok(self.actions.poll()?.map(|sample| *sample.payload()))
     }
 }

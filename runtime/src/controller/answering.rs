@@ -1,0 +1,391 @@
+//! One tick: with an observation, or without one.
+
+use rcwm_models::ACTION_LEN;
+use rcwm_models::wire::clock::monotonic_ns;
+use rcwm_models::wire::{Action, ActionSource, Observation, ObservationFlags, ObservationSample};
+
+use super::{
+    Arrival, Cause, Controller, ControllerError, EpisodeResult, Event, Pace, Response, State, Taken, Tick,
+    TickObserver, TickTimes, step,
+};
+use crate::pacing::Missing;
+use crate::policy::{Decision, PolicyError};
+use crate::telemetry::Stage;
+
+/// Ticks without an answer that are told one by one in the latency from the schedule.
+const UNANSWERED_TOLD_MAX: u64 = 1000;
+
+/// A tick on its way to the observers.
+struct Ticked<'a> {
+    observation: Option<&'a Observation>,
+    is_first: bool,
+    rewound: bool,
+    decision: Option<Decision>,
+    answer: Action,
+    overtaken: bool,
+    times: TickTimes,
+}
+
+impl Controller {
+    /// Takes an observation.
+    pub(super) fn take(
+        &mut self,
+        sample: &ObservationSample,
+        observers: &mut [&mut dyn TickObserver],
+    ) -> Result<Taken, ControllerError> {
+        let received_ns = monotonic_ns();
+        let observation: &Observation = sample.payload();
+        if self.pacing.is_stale(observation, received_ns) {
+            self.counters.note(Arrival::Stale);
+            return Ok(Taken::Nothing);
+        }
+        let arrival = self.tracker.place(sample.origin().value(), observation.sequence, observation.episode);
+        self.counters.note(arrival);
+        match arrival {
+            Arrival::Stale => Ok(Taken::Nothing),
+            Arrival::Repeated => self.answer_again(observation),
+            Arrival::Joined { .. } => self.answer_new(observation, true, received_ns, observers),
+            Arrival::Next { new_episode, .. } => {
+                let is_first = new_episode || observation.is(ObservationFlags::FIRST);
+                self.answer_new(observation, is_first, received_ns, observers)
+            }
+        }
+    }
+
+    fn answer_again(&mut self, observation: &Observation) -> Result<Taken, ControllerError> {
+        if let Some(answer) = self.answer
+            && answer.answers == observation.sequence
+        {
+            self.link.send(answer)?;
+            self.counters.answers += 1;
+        }
+        Ok(Taken::Again)
+    }
+
+    fn answer_new(
+        &mut self,
+        observation: &Observation,
+        is_first: bool,
+        received_ns: u64,
+        observers: &mut [&mut dyn TickObserver],
+    ) -> Result<Taken, ControllerError> {
+        let unanswered = self.unanswered(observation, is_first);
+        if is_first {
+            self.answer = None;
+            self.gate.start_episode();
+        }
+        let rewound = self.rewind(observation.sequence, is_first);
+        let (decision, event) = self.decide(observation, is_first);
+        let (source, action) = self.respond(event, decision.as_ref())?;
+        self.pacing.observed(observation);
+        let overtaken = self.is_overtaken(observation)?;
+        let answer = match overtaken {
+            false => self.send(observation.sequence, source, action)?,
+            true => Action {
+                answers: observation.sequence,
+                published_ns: 0,
+                source: source as u32,
+                reserved: 0,
+                action,
+            },
+        };
+        let times = TickTimes {
+            scheduled_ns: observation.scheduled_ns,
+            published_ns: observation.published_ns,
+            received_ns,
+            sent_ns: answer.published_ns,
+        };
+        self.record_times(observation, &times, unanswered);
+        self.count_episode(observation, is_first);
+        let observed = Some(observation);
+        self.show(
+            &Ticked { observation: observed, is_first, rewound, decision, answer, overtaken, times },
+            observers,
+        );
+        self.finish_episode(observation);
+        if !overtaken {
+            // Here the idle time begins.
+            self.work_ahead((!observation.is(ObservationFlags::LAST)).then_some(&answer.action));
+        }
+        Ok(Taken::New)
+    }
+
+    /// Ticks before this one, of this publisher, that were not answered in any way (real time).
+    fn unanswered(&self, observation: &Observation, is_first: bool) -> u64 {
+        match self.answer {
+            Some(answer) if !is_first && observation.period_ns > 0 => {
+                observation.sequence.saturating_sub(answer.answers.saturating_add(1))
+            }
+            _ => 0,
+        }
+    }
+
+    /// Goes back to before a tick was imagined whose observation came after all.
+    fn rewind(&mut self, sequence: u64, is_first: bool) -> bool {
+        let before = self.imagined.iter().find(|(imagined, _)| *imagined >= sequence);
+        let rewound = match before {
+            // A state that the policy has given fits it.
+            Some((_, state)) if !is_first => self.policy.set_state(state).is_ok(),
+            _ => false,
+        };
+        self.imagined.clear();
+        self.counters.late_observations += u64::from(rewound);
+        rewound
+    }
+
+    /// The policy's decision, and whether it is fit to be sent.
+    fn decide(&mut self, observation: &Observation, is_first: bool) -> (Option<Decision>, Event) {
+        if !observation.is_finite() {
+            self.counters.refused_observations += 1;
+            return (None, Event::Unfit(Cause::Observation));
+        }
+        let decided =
+            self.policy.observe(&observation.image, (!is_first).then_some(&observation.executed_action));
+        let decision = match decided {
+            Ok(decision) => decision,
+            Err(error) => return (None, Event::Unfit(self.count_failure(&error))),
+        };
+        self.record_stages(&decision);
+        self.counters.recomputed += u64::from(decision.recomputed);
+        // Every scene is new at the first image of an episode.
+        let surprise = decision.surprise.filter(|_| !is_first);
+        let Some(surprise) = surprise else { return (Some(decision), Event::Decided) };
+        self.surprise.record(&surprise);
+        let exceeded = self.settings.surprise.exceeded_by(&surprise);
+        match exceeded {
+            Some(Cause::RobotSurprise) => self.counters.robot_surprises += 1,
+            Some(_) => self.counters.environment_surprises += 1,
+            None => {}
+        }
+        (Some(decision), exceeded.map_or(Event::Decided, Event::Unfit))
+    }
+
+    fn count_failure(&mut self, error: &PolicyError) -> Cause {
+        match error {
+            PolicyError::NotFinite { .. } => {
+                self.counters.non_finite_outputs += 1;
+                Cause::Output
+            }
+            _ => {
+                self.counters.engine_errors += 1;
+                Cause::Engine
+            }
+        }
+    }
+
+    /// What to send after an event.
+    fn respond(
+        &mut self,
+        event: Event,
+        decision: Option<&Decision>,
+    ) -> Result<(ActionSource, [f32; ACTION_LEN]), ControllerError> {
+        let (state, response) = step(self.state, event, self.settings.ticks);
+        self.state = state;
+        if let State::Stopped { cause } = state {
+            return Err(ControllerError::Stopped { cause, ticks: self.settings.ticks.fallback_ticks_max });
+        }
+        let fallback = (ActionSource::Fallback, self.settings.fallback.action(self.gate.last()));
+        Ok(match (response, decision) {
+            (Response::Policy, Some(decision)) => (ActionSource::Policy, decision.action),
+            (Response::Imagine, Some(decision)) => (ActionSource::Imagined, decision.action),
+            _ => fallback,
+        })
+    }
+
+    /// Answers a tick whose observation has not come.
+    pub(super) fn go_without(
+        &mut self,
+        observers: &mut [&mut dyn TickObserver],
+    ) -> Result<(), ControllerError> {
+        let found_ns = monotonic_ns();
+        let Some(missing) = self.pacing.take_overdue(found_ns) else { return Ok(()) };
+        let (state, response) = step(self.state, Event::Overdue, self.settings.ticks);
+        self.state = state;
+        let (decision, (source, action)) = match response {
+            Response::Imagine => self.imagine(missing.sequence)?,
+            Response::Fallback => {
+                (None, (ActionSource::Fallback, self.settings.fallback.action(self.gate.last())))
+            }
+            Response::Policy | Response::Nothing => {
+                self.counters.peers_lost += 1;
+                self.pacing.rest();
+                return Ok(());
+            }
+        };
+        let answer = self.send(missing.sequence, source, action)?;
+        let times = TickTimes {
+            scheduled_ns: missing.scheduled_ns,
+            published_ns: 0,
+            received_ns: found_ns,
+            sent_ns: answer.published_ns,
+        };
+        self.record_missing(&missing, &times);
+        self.show(
+            &Ticked {
+                observation: None,
+                is_first: false,
+                rewound: false,
+                decision,
+                answer,
+                overtaken: false,
+                times,
+            },
+            observers,
+        );
+        self.work_ahead(Some(&answer.action));
+        Ok(())
+    }
+
+    /// The policy on an imagined frame; the fallback where that fails.
+    #[expect(clippy::type_complexity, reason = "what `respond` gives, and where it comes from")]
+    fn imagine(
+        &mut self,
+        sequence: u64,
+    ) -> Result<(Option<Decision>, (ActionSource, [f32; ACTION_LEN])), ControllerError> {
+        let before = self.policy.state().clone();
+        match self.policy.imagine(&self.gate.last().unwrap_or_default()) {
+            Ok(decision) => {
+                self.imagined.push((sequence, before));
+                Ok((Some(decision), (ActionSource::Imagined, decision.action)))
+            }
+            Err(error) => {
+                let cause = self.count_failure(&error);
+                Ok((None, self.respond(Event::Unfit(cause), None)?))
+            }
+        }
+    }
+
+    /// Whether a newer observation has come while this one was worked on: an answer to this one would be stale. Looked for only
+    /// where the tick's time is over, so that a tick in time loses none.
+    fn is_overtaken(&mut self, observation: &Observation) -> Result<bool, ControllerError> {
+        let period_ns = observation.period_ns;
+        if period_ns == 0 || monotonic_ns() <= observation.scheduled_ns.saturating_add(period_ns) {
+            return Ok(false);
+        }
+        self.newer = self.link.poll_observation()?;
+        let overtaken = self.newer.as_ref().is_some_and(|newer| newer.sequence != observation.sequence);
+        self.counters.overtaken_answers += u64::from(overtaken);
+        Ok(overtaken)
+    }
+
+    /// The only way onto the wire.
+    fn send(
+        &mut self,
+        sequence: u64,
+        source: ActionSource,
+        action: [f32; ACTION_LEN],
+    ) -> Result<Action, ControllerError> {
+        let passed = self.gate.pass(action);
+        self.counters.non_finite_outputs += u64::from(passed.was_not_finite);
+        self.counters.rate_limited += u64::from(passed.rate_limited);
+        let source = if passed.was_not_finite { ActionSource::Fallback } else { source };
+        let mut answer = Action {
+            answers: sequence,
+            published_ns: 0,
+            source: source as u32,
+            reserved: 0,
+            action: passed.action,
+        };
+        answer.published_ns = self.link.send(answer)?;
+        self.gate.sent(answer.action);
+        self.answer = Some(answer);
+        self.counters.answers += 1;
+        self.counters.fallback_answers += u64::from(source == ActionSource::Fallback);
+        self.counters.imagined_answers += u64::from(source == ActionSource::Imagined);
+        Ok(answer)
+    }
+
+    /// In the idle time: all of the next tick that needs only the action. What fails here fails again, and is counted, in the tick.
+    fn work_ahead(&mut self, action: Option<&[f32; ACTION_LEN]>) {
+        let start_ns = monotonic_ns();
+        // See above: the tick tells.
+        let _ = self.policy.work_ahead(action);
+        self.telemetry.record(Stage::Ahead, monotonic_ns() - start_ns);
+    }
+
+    fn record_stages(&mut self, decision: &Decision) {
+        for (stage, time_ns) in Stage::POLICY.into_iter().zip(decision.stage_ns) {
+            self.telemetry.record(stage, time_ns);
+        }
+    }
+
+    fn record_times(&mut self, observation: &Observation, times: &TickTimes, unanswered: u64) {
+        let TickTimes { scheduled_ns, published_ns, received_ns, .. } = *times;
+        let period_ns = observation.period_ns;
+        self.pace = Some(Pace::of(period_ns));
+        // An answer that was overtaken is late by all the time until now.
+        let ended_ns = if times.sent_ns == 0 { monotonic_ns() } else { times.sent_ns };
+        let telemetry = &mut self.telemetry;
+        telemetry.record(Stage::Receive, received_ns.saturating_sub(published_ns));
+        telemetry.record(Stage::Tick, ended_ns.saturating_sub(received_ns));
+        telemetry.record(Stage::EndToEnd, ended_ns.saturating_sub(published_ns));
+        // One that was sent again for us is older than we are.
+        if period_ns == 0 || observation.is(ObservationFlags::REPEATED) {
+            return;
+        }
+        telemetry.record(Stage::PublishLag, published_ns.saturating_sub(scheduled_ns));
+        let from_schedule_ns = ended_ns.saturating_sub(scheduled_ns);
+        for ticks in 0..=unanswered.min(UNANSWERED_TOLD_MAX) {
+            let waited_ns = from_schedule_ns.saturating_add(period_ns.saturating_mul(ticks));
+            telemetry.record(Stage::FromSchedule, waited_ns);
+        }
+        let counters = &mut self.counters;
+        counters.published_late += u64::from(published_ns > scheduled_ns.saturating_add(period_ns));
+        let missed = times.sent_ns == 0 || from_schedule_ns > period_ns;
+        let ours_in_time = times.sent_ns > 0 && ended_ns.saturating_sub(published_ns) <= period_ns;
+        counters.missed_deadlines += u64::from(missed) + unanswered;
+        counters.missed_deadlines_published_late += u64::from(missed && ours_in_time);
+    }
+
+    fn record_missing(&mut self, missing: &Missing, times: &TickTimes) {
+        self.telemetry.record(Stage::Imagine, times.sent_ns.saturating_sub(times.received_ns));
+        self.telemetry.record(Stage::FromSchedule, times.sent_ns.saturating_sub(times.scheduled_ns));
+        self.counters.skipped_ticks += missing.skipped;
+    }
+
+    fn show(&self, ticked: &Ticked<'_>, observers: &mut [&mut dyn TickObserver]) {
+        let Some(running) = self.running else { return };
+        let Ticked { observation, is_first, rewound, decision, answer, overtaken, times } = *ticked;
+        let Self { policy, telemetry, counters, episodes, state, .. } = self;
+        let tick = Tick {
+            observation,
+            is_first,
+            rewound,
+            decision,
+            answer,
+            overtaken,
+            state: *state,
+            times,
+            policy,
+            telemetry,
+            counters,
+            episodes,
+            running,
+        };
+        for observer in observers {
+            observer.ticked(&tick);
+        }
+    }
+
+    fn count_episode(&mut self, observation: &Observation, is_first: bool) {
+        if is_first {
+            self.cut_episode();
+        }
+        self.running.get_or_insert_with(|| EpisodeResult::start(observation)).add(observation);
+    }
+
+    fn finish_episode(&mut self, observation: &Observation) {
+        if observation.is(ObservationFlags::LAST)
+            && let Some(mut episode) = self.running.take()
+        {
+            episode.whole = episode.from_first;
+            self.whole_episodes += u64::from(episode.whole);
+            self.episodes.push(episode);
+        }
+    }
+
+    /// Puts aside an episode whose last observation will not come.
+    pub(super) fn cut_episode(&mut self) {
+        self.episodes.extend(self.running.take());
+    }
+}

@@ -1,0 +1,275 @@
+//! When the next observation is due, how to wait for it, and when it counts as late.
+//!
+//! Three times of an observation are kept apart: when it was *scheduled*, when it was *published*, and when it was *received*. With
+//! the period P that it carries, the next one is scheduled at `scheduled + P`. A simulator publishes somewhat after its schedule
+//! (it has to step and to render first), so the next one is *expected* a period after the last was published, and it is *overdue*
+//! a grace later:
+//!
+//! ```text
+//!  scheduled   published            scheduled+P   expected        overdue
+//! -----|-----------|---------------------|------------|---------------|------->
+//!      |<-- lag -->|<-------------- P -------------->|<--- grace --->|
+//!                             blocks            | spins |   blocks
+//! ```
+//!
+//! Waiting blocks until shortly before the expected time, polls from there to shortly after it, and blocks again. Where ticks
+//! were slept through, only the newest is made up for: the others are counted, never run in a burst. In lock-step nothing is due.
+
+use std::time::Duration;
+
+use rcwm_models::wire::{Observation, ObservationFlags};
+
+/// Shortest period that is believed, in ns: one that a peer has garbled must not make the loop run wild.
+const PERIOD_NS_MIN: u64 = 50_000;
+/// A wait for which nothing is due.
+const NOTHING_DUE: Duration = Duration::from_secs(3600);
+
+/// How to wait, and what is late.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct PacingSettings {
+    /// Polls so long before and after the expected time; in lock-step so long from the start of a wait.
+    pub spin: Duration,
+    /// An observation is overdue so many periods after it was expected.
+    pub grace_periods: f64,
+    /// An observation is stale when it was scheduled more than so many periods ago as it arrives.
+    pub stale_periods: f64,
+}
+
+impl Default for PacingSettings {
+    fn default() -> Self {
+        Self { spin: Duration::from_micros(50), grace_periods: 0.5, stale_periods: 2.0 }
+    }
+}
+
+/// What to do now.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum Plan {
+    /// Wait for a message, polling for `spin` first; then ask again.
+    Wait {
+        /// How long to poll.
+        spin: Duration,
+        /// The longest wait, polling included.
+        timeout: Duration,
+    },
+    /// An observation is missing: see [`Pacing::take_overdue`].
+    Overdue,
+}
+
+/// A tick whose observation has not come.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub struct Missing {
+    /// The sequence that the observation would have had.
+    pub sequence: u64,
+    /// When it was scheduled, CLOCK_MONOTONIC in ns.
+    pub scheduled_ns: u64,
+    /// Ticks before it that were slept through.
+    pub skipped: u64,
+}
+
+/// The schedule of the peer, as far as its last observation tells.
+#[derive(Debug, Clone, Copy)]
+pub struct Pacing {
+    settings: PacingSettings,
+    schedule: Option<Schedule>,
+}
+
+#[derive(Debug, Clone, Copy)]
+struct Schedule {
+    sequence: u64,
+    scheduled_ns: u64,
+    /// The later of scheduled and published.
+    base_ns: u64,
+    period_ns: u64,
+    grace_ns: u64,
+    /// Ticks after `sequence` that were found overdue.
+    overdue: u64,
+}
+
+impl Schedule {
+    /// When the observation `ticks` after the last is expected.
+    fn expected_ns(&self, ticks: u64) -> u64 {
+        self.base_ns.saturating_add(self.period_ns.saturating_mul(ticks))
+    }
+}
+
+impl Pacing {
+    /// Nothing is due yet.
+    #[must_use]
+    pub fn new(settings: PacingSettings) -> Self {
+        Self { settings, schedule: None }
+    }
+
+    /// Takes the schedule over from an observation. After the last of an episode nothing is due: a reset takes its time.
+    pub fn observed(&mut self, observation: &Observation) {
+        if observation.period_ns == 0 || observation.is(ObservationFlags::LAST) {
+            self.schedule = None;
+            return;
+        }
+        let period_ns = observation.period_ns.max(PERIOD_NS_MIN);
+        self.schedule = Some(Schedule {
+            sequence: observation.sequence,
+            scheduled_ns: observation.scheduled_ns,
+            base_ns: observation.scheduled_ns.max(observation.published_ns),
+            period_ns,
+            grace_ns: share(period_ns, self.settings.grace_periods),
+            overdue: 0,
+        });
+    }
+
+    /// Nothing is due any more.
+    pub fn rest(&mut self) {
+        self.schedule = None;
+    }
+
+    /// Whether an observation was scheduled so long ago that an answer to it would do harm. Never so in lock-step, where the
+    /// publisher waits.
+    #[must_use]
+    pub fn is_stale(&self, observation: &Observation, received_ns: u64) -> bool {
+        let age_ns = received_ns.saturating_sub(observation.scheduled_ns);
+        observation.period_ns > 0
+            && age_ns > share(observation.period_ns.max(PERIOD_NS_MIN), self.settings.stale_periods)
+    }
+
+    /// What to do at `now_ns`.
+    #[must_use]
+    pub fn plan(&self, now_ns: u64) -> Plan {
+        let spin = self.settings.spin;
+        let Some(schedule) = self.schedule else { return Plan::Wait { spin, timeout: NOTHING_DUE } };
+        let expected_ns = schedule.expected_ns(schedule.overdue + 1);
+        let overdue_ns = expected_ns.saturating_add(schedule.grace_ns);
+        if now_ns >= overdue_ns {
+            return Plan::Overdue;
+        }
+        let spin_ns = (spin.as_nanos() as u64).min(schedule.grace_ns);
+        let until = |time_ns: u64| Duration::from_nanos(time_ns - now_ns);
+        let (spin_from_ns, spin_until_ns) =
+            (expected_ns.saturating_sub(spin_ns), expected_ns.saturating_add(spin_ns));
+        if now_ns < spin_from_ns {
+            Plan::Wait { spin: Duration::ZERO, timeout: until(spin_from_ns) }
+        } else if now_ns < spin_until_ns {
+            Plan::Wait { spin: until(spin_until_ns), timeout: until(spin_until_ns) }
+        } else {
+            Plan::Wait { spin: Duration::ZERO, timeout: until(overdue_ns) }
+        }
+    }
+
+    /// The newest tick that is overdue at `now_ns`; each is given once.
+    pub fn take_overdue(&mut self, now_ns: u64) -> Option<Missing> {
+        let schedule = self.schedule.as_mut()?;
+        let over_ns = now_ns.checked_sub(schedule.base_ns)?.checked_sub(schedule.grace_ns)?;
+        let newest = over_ns / schedule.period_ns;
+        let skipped = newest.checked_sub(schedule.overdue + 1)?;
+        schedule.overdue = newest;
+        Some(Missing {
+            sequence: schedule.sequence.saturating_add(newest),
+            scheduled_ns: schedule.scheduled_ns.saturating_add(schedule.period_ns.saturating_mul(newest)),
+            skipped,
+        })
+    }
+}
+
+/// So many periods, in ns.
+fn share(period_ns: u64, periods: f64) -> u64 {
+    (period_ns as f64 * periods) as u64
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    const PERIOD_NS: u64 = 1_000_000;
+    const PUBLISHED_NS: u64 = 10_200_000;
+
+    fn settings() -> PacingSettings {
+        PacingSettings { spin: Duration::from_nanos(100_000), ..PacingSettings::default() }
+    }
+
+    /// Sequence 7, scheduled at 10 ms, published 0.2 ms later, every ms.
+    fn observation() -> Observation {
+        let mut observation = Observation::zeroed();
+        (observation.sequence, observation.period_ns) = (7, PERIOD_NS);
+        (observation.scheduled_ns, observation.published_ns) = (10_000_000, PUBLISHED_NS);
+        observation
+    }
+
+    fn after(observation: &Observation) -> Pacing {
+        let mut pacing = Pacing::new(settings());
+        pacing.observed(observation);
+        pacing
+    }
+
+    fn wait(spin_ns: u64, timeout_ns: u64) -> Plan {
+        Plan::Wait { spin: Duration::from_nanos(spin_ns), timeout: Duration::from_nanos(timeout_ns) }
+    }
+
+    #[test]
+    fn it_blocks_then_polls_around_the_expected_time_then_blocks_until_the_grace_is_over() {
+        let pacing = after(&observation());
+        let expected_ns = PUBLISHED_NS + PERIOD_NS;
+        assert_eq!(pacing.plan(PUBLISHED_NS), wait(0, 900_000));
+        assert_eq!(pacing.plan(expected_ns - 100_000), wait(200_000, 200_000));
+        assert_eq!(pacing.plan(expected_ns + 99_999), wait(1, 1));
+        assert_eq!(pacing.plan(expected_ns + 100_000), wait(0, 400_000));
+        assert_eq!(pacing.plan(expected_ns + 500_000), Plan::Overdue);
+    }
+
+    #[test]
+    fn a_missing_tick_is_given_once_with_its_own_schedule() {
+        let mut pacing = after(&observation());
+        let overdue_ns = PUBLISHED_NS + PERIOD_NS * 3 / 2;
+        assert_eq!(pacing.take_overdue(overdue_ns - 1), None);
+        let missing = Missing { sequence: 8, scheduled_ns: 11_000_000, skipped: 0 };
+        assert_eq!(pacing.take_overdue(overdue_ns), Some(missing));
+        assert_eq!(pacing.take_overdue(overdue_ns + PERIOD_NS - 1), None);
+        assert_eq!(pacing.take_overdue(overdue_ns + PERIOD_NS).map(|missing| missing.sequence), Some(9));
+    }
+
+    #[test]
+    fn ticks_that_were_slept_through_are_counted_and_not_made_up_for() {
+        let mut pacing = after(&observation());
+        let late_ns = PUBLISHED_NS + 10 * PERIOD_NS;
+        let missing = Missing { sequence: 16, scheduled_ns: 19_000_000, skipped: 8 };
+        assert_eq!(pacing.take_overdue(late_ns), Some(missing));
+        assert_eq!(pacing.take_overdue(late_ns), None);
+        assert_ne!(pacing.plan(late_ns), Plan::Overdue);
+    }
+
+    #[test]
+    fn nothing_is_due_in_lock_step_after_a_last_one_and_at_rest() {
+        let idle = Plan::Wait { spin: settings().spin, timeout: NOTHING_DUE };
+        let mut lockstep = observation();
+        lockstep.period_ns = 0;
+        let mut last = observation();
+        last.flags = ObservationFlags::LAST.0;
+        let mut resting = after(&observation());
+        resting.rest();
+        for mut pacing in [after(&lockstep), after(&last), resting] {
+            assert_eq!((pacing.plan(u64::MAX), pacing.take_overdue(u64::MAX)), (idle, None));
+        }
+    }
+
+    #[test]
+    fn stale_is_what_was_scheduled_more_than_two_periods_before_it_came() {
+        let pacing = Pacing::new(settings());
+        let mut seen = observation();
+        assert!(!pacing.is_stale(&seen, seen.scheduled_ns + 2 * PERIOD_NS));
+        assert!(pacing.is_stale(&seen, seen.scheduled_ns + 2 * PERIOD_NS + 1));
+        assert!(!pacing.is_stale(&seen, 0), "one from the future is not stale");
+        seen.period_ns = 0;
+        assert!(!pacing.is_stale(&seen, u64::MAX));
+    }
+
+    #[test]
+    fn absurd_periods_neither_overflow_nor_run_wild() {
+        let mut seen = observation();
+        seen.period_ns = u64::MAX;
+        assert!(matches!(after(&seen).plan(u64::MAX - 1), Plan::Wait { .. }));
+        seen.period_ns = 1;
+        let mut pacing = after(&seen);
+        let mut ticks = 0;
+        for now_ns in (PUBLISHED_NS..PUBLISHED_NS + PERIOD_NS).step_by(1000) {
+            ticks += u64::from(pacing.take_overdue(now_ns).is_some());
+        }
+        assert!(ticks <= PERIOD_NS / PERIOD_NS_MIN, "{ticks}");
+    }
+}

@@ -1,0 +1,195 @@
+//! What Linux grants a thread that must be on time: a fixed priority before all ordinary threads, memory that stays, a core.
+//!
+//! Everything is asked for, then read back: what is reported is what holds, not what was asked for. None of it makes Linux a hard
+//! real-time system; whether the kernel is a PREEMPT_RT one is reported beside it.
+
+use std::io::Error;
+
+use rustix::process::Pid;
+use rustix::thread::{CpuSet, sched_getaffinity, sched_setaffinity};
+use serde::Serialize;
+
+/// What to ask for.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
+pub struct Request {
+    /// SCHED_FIFO with this priority, 1 to 99, and locked memory.
+    pub priority: Option<u8>,
+    /// Keeps the thread on this core.
+    pub cpu: Option<usize>,
+}
+
+/// One thing that was asked for.
+#[derive(Debug, Clone, PartialEq, Eq, Serialize)]
+pub struct Grant {
+    /// What.
+    pub what: String,
+    /// Whether it holds, as read back from the system.
+    pub granted: bool,
+    /// What was read back, or why it was refused.
+    pub detail: String,
+}
+
+/// Everything that was asked for, and the kernel it was asked of.
+#[derive(Debug, Clone, PartialEq, Eq, Serialize)]
+pub struct Granted {
+    /// One entry for each thing that was asked for.
+    pub grants: Vec<Grant>,
+    /// Whether the kernel says that it is a PREEMPT_RT one.
+    pub kernel_preempt_rt: bool,
+}
+
+impl Granted {
+    /// Whether all that was asked for holds.
+    #[must_use]
+    pub fn all(&self) -> bool {
+        self.grants.iter().all(|grant| grant.granted)
+    }
+
+    /// One line for each thing, and one for the kernel.
+    pub fn lines(&self) -> impl Iterator<Item = String> {
+        let grants = self.grants.iter().map(|Grant { what, granted, detail }| {
+            format!("{what}: {}: {detail}", if *granted { "granted" } else { "refused" })
+        });
+        let kernel = match self.kernel_preempt_rt {
+            true => "kernel: PREEMPT_RT",
+            false => "kernel: not PREEMPT_RT, so that the longest delay is not bounded",
+        };
+        grants.chain([kernel.to_owned()])
+    }
+}
+
+/// Asks for it, for the calling thread (priority, core) and for the process (memory); none where nothing is asked for.
+#[must_use]
+pub fn ask(request: Request) -> Option<Granted> {
+    if request == Request::default() {
+        return None;
+    }
+    let mut grants = Vec::new();
+    if let Some(priority) = request.priority {
+        grants.push(fixed_priority(priority));
+        grants.push(locked_memory());
+    }
+    if let Some(cpu) = request.cpu {
+        grants.push(one_core(cpu));
+    }
+    let kernel = std::fs::read_to_string("/sys/kernel/realtime");
+    Some(Granted { grants, kernel_preempt_rt: kernel.is_ok_and(|text| text.trim() == "1") })
+}
+
+fn grant(what: String, result: Result<String, String>) -> Grant {
+    let granted = result.is_ok();
+    Grant { what, granted, detail: result.unwrap_or_else(|reason| reason) }
+}
+
+fn fixed_priority(priority: u8) -> Grant {
+    let what = format!("SCHED_FIFO priority {priority}");
+    grant(what, set_fixed_priority(priority).and_then(|()| read_fixed_priority(priority)))
+}
+
+fn set_fixed_priority(priority: u8) -> Result<(), String> {
+    let param = libc::sched_param { sched_priority: i32::from(priority) };
+    // Threads that this one starts later are ordinary ones again.
+    let policy = libc::SCHED_FIFO | libc::SCHED_RESET_ON_FORK;
+    // SAFETY: 0 is the calling thread, and `param` lives through the call.
+    match unsafe { libc::sched_setscheduler(0, policy, &raw const param) } {
+        0 => Ok(()),
+        _ => Err(format!("{}; run as root, give CAP_SYS_NICE, or raise `ulimit -r`", Error::last_os_error())),
+    }
+}
+
+fn read_fixed_priority(expected: u8) -> Result<String, String> {
+    let mut param = libc::sched_param { sched_priority: 0 };
+    // SAFETY: 0 is the calling thread.
+    let policy = unsafe { libc::sched_getscheduler(0) };
+    // SAFETY: 0 is the calling thread, and `param` lives through the call.
+    let read = unsafe { libc::sched_getparam(0, &raw mut param) };
+    let found = param.sched_priority;
+    if read == 0 && policy & !libc::SCHED_RESET_ON_FORK == libc::SCHED_FIFO && found == i32::from(expected) {
+        Ok(format!("the loop's thread runs with SCHED_FIFO, priority {found}"))
+    } else {
+        Err(format!("the system says policy {policy}, priority {found}"))
+    }
+}
+
+fn locked_memory() -> Grant {
+    // SAFETY: locking pages changes no memory that a program can see.
+    let result = match unsafe { libc::mlockall(libc::MCL_CURRENT | libc::MCL_FUTURE) } {
+        0 => locked_kb().filter(|kb| *kb > 0).map_or_else(
+            || Err("the system says that no memory is locked".to_owned()),
+            |kb| Ok(format!("{:.1} MiB locked, and what will be allocated", kb as f64 / 1024.0)),
+        ),
+        _ => Err(format!("{}; run as root, give CAP_IPC_LOCK, or raise `ulimit -l`", Error::last_os_error())),
+    };
+    grant("locked memory".into(), result)
+}
+
+/// Memory that the system says is locked, in kB.
+fn locked_kb() -> Option<u64> {
+    let status = std::fs::read_to_string("/proc/self/status").ok()?;
+    let line = status.lines().find_map(|line| line.strip_prefix("VmLck:"))?;
+    line.trim().strip_suffix("kB")?.trim().parse().ok()
+}
+
+fn one_core(cpu: usize) -> Grant {
+    let result = if cpu < CpuSet::MAX_CPU { keep_on(cpu) } else { Err("no such core".to_owned()) };
+    grant(format!("core {cpu}"), result)
+}
+
+fn keep_on(cpu: usize) -> Result<String, String> {
+    let this_thread: Option<Pid> = None;
+    let mut wanted = CpuSet::new();
+    wanted.set(cpu);
+    sched_setaffinity(this_thread, &wanted)
+        .map_err(|error| format!("{error}; is there such a core, and may this process use it?"))?;
+    match sched_getaffinity(this_thread) {
+        Ok(found) if found == wanted => Ok("the loop's thread stays on it".into()),
+        Ok(found) => Err(format!("the system says {} cores", found.count())),
+        Err(error) => Err(error.to_string()),
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    /// In a thread of its own: priority and core belong to threads.
+    fn asked(request: Request) -> Option<Granted> {
+        std::thread::spawn(move || ask(request)).join().unwrap()
+    }
+
+    #[test]
+    fn nothing_is_asked_for_unless_wanted() {
+        assert_eq!(asked(Request::default()), None);
+    }
+
+    #[test]
+    fn a_core_is_granted_where_there_is_one_and_refused_where_there_is_none() {
+        let available = sched_getaffinity(None).unwrap();
+        let cpu = (0..CpuSet::MAX_CPU).find(|cpu| available.is_set(*cpu)).unwrap();
+        let granted = asked(Request { priority: None, cpu: Some(cpu) }).unwrap();
+        assert!(granted.all() && granted.grants.len() == 1, "{granted:?}");
+        for none in [CpuSet::MAX_CPU - 1, CpuSet::MAX_CPU, usize::MAX] {
+            let refused = asked(Request { priority: None, cpu: Some(none) }).unwrap();
+            assert!(!refused.all() && !refused.grants[0].detail.is_empty(), "{refused:?}");
+        }
+    }
+
+    #[test]
+    fn a_priority_that_does_not_exist_is_refused_with_a_reason() {
+        let refused = grant("priority".into(), set_fixed_priority(200).map(|()| String::new()));
+        assert!(!refused.granted && refused.detail.contains("CAP_SYS_NICE"), "{refused:?}");
+    }
+
+    #[test]
+    fn what_is_not_granted_is_said_line_by_line() {
+        let grants = vec![
+            Grant { what: "core 1".into(), granted: true, detail: "kept".into() },
+            Grant { what: "SCHED_FIFO priority 50".into(), granted: false, detail: "not permitted".into() },
+        ];
+        let granted = Granted { grants, kernel_preempt_rt: false };
+        let lines: Vec<_> = granted.lines().collect();
+        assert_eq!(lines[0], "core 1: granted: kept");
+        assert_eq!(lines[1], "SCHED_FIFO priority 50: refused: not permitted");
+        assert!(lines[2].contains("not PREEMPT_RT") && lines.len() == 3 && !granted.all());
+    }
+}

@@ -1,0 +1,210 @@
+//! The controller in real time and at its limits, against a real peer on a real link.
+
+#![allow(clippy::unwrap_used, reason = "a test that fails panics")]
+
+mod support;
+
+use std::time::Duration;
+
+use rcwm_models::bundle::PartName;
+use rcwm_models::wire::clock::monotonic_ns;
+use rcwm_models::wire::{Action, ActionSource, Observation, SimulatorLink, Wait};
+use rcwm_runtime::controller::{Cause, ControllerError, Ended, Fallback, State, SurpriseLimits, TickLimits};
+use rcwm_runtime::{EngineSettings, Policy};
+use support::{ask, dividing_by_zero, image, observation, own_link, smallest_bundle, start_controller_with};
+
+const PERIOD_NS: u64 = 50_000_000;
+/// Far longer than anything here takes.
+const NEVER: Duration = Duration::from_secs(20);
+
+/// An observation of a fixed clock, due now.
+fn due_now(sequence: u64) -> Observation {
+    let mut observation = observation(sequence, sequence as u32);
+    (observation.scheduled_ns, observation.period_ns) = (monotonic_ns(), PERIOD_NS);
+    observation
+}
+
+/// The next action that fits, whatever else comes before it.
+fn next(peer: &SimulatorLink, what: &str, fits: impl Fn(&Action) -> bool) -> Action {
+    let start = std::time::Instant::now();
+    while start.elapsed() < NEVER {
+        if let (Wait::Message(action), _) = peer.wait_action(Duration::from_millis(100)).unwrap()
+            && fits(&action)
+        {
+            return action;
+        }
+    }
+    panic!("no {what}");
+}
+
+fn is(source: ActionSource) -> impl Fn(&Action) -> bool {
+    move |action| action.source == source as u32
+}
+
+#[test]
+fn missing_observations_are_imagined_then_fallen_back_from_then_borne_in_silence() {
+    let link = own_link();
+    let peer = link.peer();
+    let ticks = TickLimits { imagined_ticks_max: 3, fallback_ticks_max: 2 };
+    let controller = start_controller_with(&smallest_bundle(), &link, |settings| {
+        (settings.ticks, settings.fallback) = (ticks, Fallback::Zero);
+    });
+    ask(&peer, &due_now(0));
+    let seen = ask(&peer, &due_now(1));
+    let imagined = next(&peer, "imagined action", is(ActionSource::Imagined));
+    assert!(imagined.answers > seen.answers);
+    let fallback = next(&peer, "fallback", is(ActionSource::Fallback));
+    assert!(fallback.answers > imagined.answers && fallback.action == [0.0; 4]);
+    // Silence: a few periods in which one more fallback may come, and nothing after it.
+    std::thread::sleep(Duration::from_nanos(6 * PERIOD_NS));
+    peer.poll_action().unwrap();
+    let (quiet, _) = peer.wait_action(Duration::from_nanos(3 * PERIOD_NS)).unwrap();
+    assert!(matches!(quiet, Wait::TimedOut), "{quiet:?}");
+    // It is there again, from where it stood still.
+    assert_eq!(ask(&peer, &due_now(2)).source, ActionSource::Policy as u32);
+    peer.close().unwrap();
+    let (ended, report) = controller.join().unwrap();
+    assert_eq!(ended.unwrap(), Ended::SimulatorClosed);
+    let counters = report.counters;
+    assert_eq!((counters.peers_lost, counters.late_observations), (1, 1), "{counters:?}");
+    assert_eq!((counters.imagined_answers, counters.fallback_answers), (3, 2), "{counters:?}");
+}
+
+#[test]
+fn an_observation_that_comes_after_it_was_imagined_is_answered_as_if_it_had_been_in_time() {
+    let link = own_link();
+    let peer = link.peer();
+    let controller = start_controller_with(&smallest_bundle(), &link, |settings| {
+        settings.pacing.stale_periods = 1000.0;
+        settings.ticks = TickLimits { imagined_ticks_max: 1000, fallback_ticks_max: 1000 };
+    });
+    let mut policy = Policy::load(&smallest_bundle(), EngineSettings::tract()).unwrap();
+    for sequence in 0..6 {
+        if sequence == 3 {
+            next(&peer, "imagined 3", |action| action.answers == 3 && is(ActionSource::Imagined)(action));
+        }
+        if sequence == 4 {
+            // Some ticks further than it is.
+            next(&peer, "imagined 6", |action| action.answers >= 6 && is(ActionSource::Imagined)(action));
+        }
+        let mut sent = due_now(sequence);
+        sent.scheduled_ns -= 1000;
+        peer.publish(|slot| *slot = sent).unwrap();
+        let answers = |action: &Action| action.answers == sequence && is(ActionSource::Policy)(action);
+        let answer = next(&peer, "policy's answer", answers);
+        let expected =
+            policy.observe(&image(sequence as u32), (sequence > 0).then_some(&sent.executed_action));
+        assert_eq!(answer.action, expected.unwrap().action, "sequence {sequence}");
+    }
+    peer.close().unwrap();
+    let counters = controller.join().unwrap().1.counters;
+    assert!(counters.late_observations >= 2 && counters.stale_observations == 0, "{counters:?}");
+}
+
+#[test]
+fn an_observation_that_was_due_long_ago_is_dropped_and_counted() {
+    let link = own_link();
+    let peer = link.peer();
+    let controller = start_controller_with(&smallest_bundle(), &link, |_| {});
+    ask(&peer, &due_now(0));
+    let mut old = due_now(1);
+    old.scheduled_ns -= 3 * PERIOD_NS;
+    peer.publish(|slot| *slot = old).unwrap();
+    next(&peer, "imagined action", is(ActionSource::Imagined));
+    let answer = ask(&peer, &due_now(9));
+    assert_eq!(answer.source, ActionSource::Policy as u32);
+    peer.close().unwrap();
+    let counters = controller.join().unwrap().1.counters;
+    assert_eq!((counters.stale_observations, counters.observations), (1, 3), "{counters:?}");
+}
+
+#[test]
+fn in_lock_step_nothing_is_overdue() {
+    let link = own_link();
+    let peer = link.peer();
+    let controller = start_controller_with(&smallest_bundle(), &link, |_| {});
+    ask(&peer, &observation(0, 0));
+    std::thread::sleep(Duration::from_millis(300));
+    ask(&peer, &observation(1, 1));
+    peer.close().unwrap();
+    let counters = controller.join().unwrap().1.counters;
+    assert_eq!((counters.imagined_answers, counters.fallback_answers), (0, 0));
+}
+
+#[test]
+fn a_policy_that_is_unfit_for_too_long_stops_the_run_and_says_why() {
+    let bundle = dividing_by_zero(PartName::Actor);
+    let link = own_link();
+    let peer = link.peer();
+    let ticks = TickLimits { fallback_ticks_max: 3, ..TickLimits::default() };
+    let controller = start_controller_with(bundle.path(), &link, |settings| settings.ticks = ticks);
+    for sequence in 0..3 {
+        assert_eq!(ask(&peer, &observation(sequence, sequence as u32)).source, ActionSource::Fallback as u32);
+    }
+    peer.publish(|slot| *slot = observation(3, 3)).unwrap();
+    let (ended, report) = controller.join().unwrap();
+    assert!(matches!(ended, Err(ControllerError::Stopped { cause: Cause::Output, ticks: 3 })), "{ended:?}");
+    assert_eq!((report.ended, report.last_state), (Ended::Stopped, State::Stopped { cause: Cause::Output }));
+    assert_eq!(report.counters.answers, 3);
+}
+
+#[test]
+fn a_surprise_over_its_limit_is_answered_by_the_fallback_except_at_an_episode_s_first_image() {
+    let none = SurpriseLimits::default();
+    for (surprise, cause) in [
+        (SurpriseLimits { robot_max: Some(0.0), ..none }, Cause::RobotSurprise),
+        (SurpriseLimits { environment_max: Some(0.0), ..none }, Cause::EnvironmentSurprise),
+    ] {
+        let link = own_link();
+        let peer = link.peer();
+        let controller =
+            start_controller_with(&smallest_bundle(), &link, |settings| settings.surprise = surprise);
+        assert_eq!(ask(&peer, &observation(0, 0)).source, ActionSource::Policy as u32);
+        for sequence in 1..5 {
+            let answer = ask(&peer, &observation(sequence, sequence as u32));
+            assert_eq!(answer.source, ActionSource::Fallback as u32);
+        }
+        peer.close().unwrap();
+        let report = controller.join().unwrap().1;
+        let robots = if cause == Cause::RobotSurprise { 4 } else { 0 };
+        let counters = report.counters;
+        assert_eq!((counters.robot_surprises, counters.environment_surprises), (robots, 4 - robots));
+        assert_eq!(report.last_state, State::Fallback { ticks: 4, cause });
+        assert!(report.surprise.is_some_and(|surprise| surprise.count == 4));
+    }
+}
+
+#[test]
+fn the_rate_limit_holds_between_any_two_actions_on_the_wire() {
+    let link = own_link();
+    let peer = link.peer();
+    let controller = start_controller_with(&smallest_bundle(), &link, |settings| {
+        (settings.rate_max, settings.fallback) = (Some(0.01), Fallback::Given([1.0, -1.0, 1.0, -1.0]));
+    });
+    let mut last = [0.0_f32; 4];
+    for sequence in 0..20 {
+        let mut sent = observation(sequence, sequence as u32);
+        sent.reward = if sequence % 5 == 4 { f32::NAN } else { 0.0 };
+        let answer = ask(&peer, &sent).action;
+        assert!(
+            answer.iter().zip(last).all(|(a, b)| (a - b).abs() <= 0.01 + 1e-6),
+            "{answer:?} after {last:?}"
+        );
+        last = answer;
+    }
+    peer.close().unwrap();
+    assert!(controller.join().unwrap().1.counters.rate_limited >= 4);
+}
+
+#[test]
+fn a_peer_that_is_silent_for_too_long_ends_the_run() {
+    let link = own_link();
+    let peer = link.peer();
+    let controller = start_controller_with(&smallest_bundle(), &link, |settings| {
+        settings.silence_max = Some(Duration::from_millis(300));
+    });
+    ask(&peer, &observation(0, 0));
+    let (ended, report) = controller.join().unwrap();
+    assert!(matches!(ended, Err(ControllerError::PeerLost { .. })), "{ended:?}");
+    assert_eq!(report.ended, Ended::PeerLost);
+}
