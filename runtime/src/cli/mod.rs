@@ -86,7 +86,7 @@ Environment:
 #[derive(Debug, Subcommand)]
 enum Verb {
     /// Answers a simulator's (or a robot's) observations over shared memory
-    Run(run::RunArguments),
+    Run(Box<run::RunArguments>),
     /// Checks a bundle against its golden values: every part and the whole tick
     Verify(verify::VerifyArguments),
     /// Shows parts, shapes, sizes, operators, and what a tick costs
