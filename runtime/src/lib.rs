@@ -13,6 +13,7 @@
 //! | [`realtime`] | what Linux grants a thread that must be on time |
 //! | [`telemetry`] | latency histograms, one per stage |
 //! | [`record`] | films, strips and episodes of what the policy saw, written beside the loop |
+//! | [`mod@log`] | every tick of a run, replayed bit for bit or turned into episodes |
 //! | [`verify`] | a bundle against its golden values |
 //! | [`inspect`] | what a bundle holds and what a tick costs |
 //! | [`mod@bench`] | the tick's latency on this machine, engines interleaved |
@@ -42,6 +43,7 @@ pub mod controller;
 pub mod engine;
 pub mod inspect;
 pub mod kernels;
+pub mod log;
 pub mod operators;
 pub mod pacing;
 pub mod policy;

@@ -3,16 +3,19 @@
 //! | exit code | meaning |
 //! | --- | --- |
 //! | 0 | done; also when ended by Ctrl-C or SIGTERM, after the summary |
-//! | 1 | an error: one line on stderr says which, and what to do; or a bundle that does not verify |
+//! | 1 | an error: one line on stderr says which, and what to do; or a bundle that does not verify, a replay that differs |
 //! | 2 | the command line was not understood |
 //! | 3 | no observation came within --timeout |
 //! | 130 | ended at once by a second Ctrl-C |
 
 mod bench;
 mod inspect;
+mod observers;
+mod replay;
 mod run;
 mod safety;
 mod status;
+mod telemetry;
 mod verify;
 
 use std::path::{Path, PathBuf};
@@ -70,6 +73,7 @@ Examples:
   rcwm-runtime verify --bundle models/bundles/debug
   rcwm-runtime run --bundle models/bundles/debug --instance demo --record runs/demo --json runs/demo.json
   rcwm-runtime bench --bundle models/bundles/debug --engine all --ticks 2000
+  rcwm-runtime replay --log runs/demo.rcwmlog --bundle models/bundles/debug
 
 Exit codes:
   0 done (also after Ctrl-C), 1 error or not verified, 2 usage, 3 no observation within --timeout, 4 stopped: the policy
@@ -82,13 +86,17 @@ Environment:
 #[derive(Debug, Subcommand)]
 enum Verb {
     /// Answers a simulator's (or a robot's) observations over shared memory
-    Run(run::RunArguments),
+    Run(Box<run::RunArguments>),
     /// Checks a bundle against its golden values: every part and the whole tick
     Verify(verify::VerifyArguments),
     /// Shows parts, shapes, sizes, operators, and what a tick costs
     Inspect(inspect::InspectArguments),
     /// Measures the tick's latency on this machine
     Bench(bench::BenchArguments),
+    /// Makes a logged run's decisions again and compares them bit for bit; turns a log into episodes
+    Replay(replay::ReplayArguments),
+    /// Shows the latencies of a logged run, and writes and draws them
+    Telemetry(telemetry::TelemetryArguments),
 }
 
 /// One engine or all that are there.
@@ -127,6 +135,8 @@ pub fn main() -> ExitCode {
         Verb::Verify(arguments) => verify::run(&arguments),
         Verb::Inspect(arguments) => inspect::run(&arguments),
         Verb::Bench(arguments) => bench::run(&arguments),
+        Verb::Replay(arguments) => replay::run(&arguments),
+        Verb::Telemetry(arguments) => telemetry::run(&arguments),
     };
     match result {
         Ok(()) => ExitCode::SUCCESS,

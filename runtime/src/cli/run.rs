@@ -6,20 +6,21 @@ use std::time::Duration;
 
 use anyhow::Context;
 use clap::Args;
-use rcwm_models::bundle::Bundle;
 
+use super::observers::{Left, ObserverArguments, Observers};
 use super::safety::{SafetyArguments, TimeArguments};
 use super::status::StatusLine;
 use crate::controller::{Controller, ControllerError, ControllerSettings, Ended, TickObserver};
 use crate::engine::{EngineKind, EngineSettings};
+use crate::log::LogSettings;
 use crate::policy::{Policy, Sampling};
-use crate::record::{Recorded, Recorder};
 
 /// Arguments of `run`.
 #[derive(Debug, Args)]
 #[command(after_help = "Examples:\n  \
     rcwm-simulator serve --task reach --instance demo --episodes 3 &\n  \
-    rcwm-runtime run --bundle models/bundles/debug --instance demo --record runs/demo\n\n\
+    rcwm-runtime run --bundle models/bundles/debug --instance demo --record runs/demo\n  \
+    rcwm-runtime run --bundle models/bundles/debug --instance demo --log demo.rcwmlog --telemetry demo.jsonl\n  \
     rcwm-runtime run --bundle DIR --instance arm --realtime --cpu 3 --fallback zero --rate-limit 0.2 \\\n    \
     --surprise-robot-max 20\n\n\
     Ends when the simulator says that it closes, after --episodes, or on Ctrl-C. A simulator that dies is waited for:\n\
@@ -58,12 +59,8 @@ pub(super) struct RunArguments {
     /// Seed of --sample
     #[arg(long, value_name = "SEED", default_value_t = 0)]
     seed: u64,
-    /// Records films, strips and episodes into this folder
-    #[arg(long, value_name = "DIR")]
-    record: Option<PathBuf>,
-    /// Records at most this many episodes
-    #[arg(long, value_name = "N", default_value_t = 3)]
-    record_episodes: u64,
+    #[command(flatten)]
+    observers: ObserverArguments,
     /// Writes the summary to this file as JSON
     #[arg(long, value_name = "FILE")]
     json: Option<PathBuf>,
@@ -83,26 +80,35 @@ pub(super) fn run(arguments: &RunArguments) -> anyhow::Result<()> {
         false => Sampling::Mode,
     };
     let policy = Policy::new(&bundle, engine, sampling)?;
-    let mut recorder = start_recorder(arguments, &bundle, engine)?;
-    let mut controller = Controller::open(policy, arguments.controller_settings())?;
+    let settings = arguments.controller_settings();
+    let log = LogSettings {
+        fallback: settings.fallback,
+        rate_max: settings.rate_max,
+        ..LogSettings::new(&arguments.instance, engine, sampling)
+    };
+    let mut observers = Observers::start(&arguments.observers, &bundle, &policy, log)?;
+    let mut controller = Controller::open(policy, settings)?;
     let mut status = StatusLine::start(&arguments.instance).context("starting the status line")?;
     // Asked for last: the other threads stay ordinary ones.
     let granted = arguments.time.ask()?;
-    let result = control(&mut controller, &mut status, recorder.as_mut(), &stop);
+    let result = control(&mut controller, &mut status, &mut observers, &stop);
     drop(status);
     let ended = result.as_ref().map_or_else(Ended::from, |ended| *ended);
     let mut report = controller.report(arguments.engine, ended);
     report.realtime = granted;
+    let telemetry = controller.telemetry().clone();
     // The simulator is told before anything slow is done.
     let closed = controller.close();
-    report.frames_dropped = recorder.as_ref().map_or(0, Recorder::dropped);
-    let recorded = finish_recorder(recorder);
+    report.frames_dropped = observers.frames_dropped();
+    let left = observers.finish();
     if report.counters.observations > 0 || result.is_ok() {
         print!("{}", report.summary());
         super::write_json(arguments.json.as_ref(), &report)?;
     }
+    print!("{}", left.as_ref().map(Left::lines).unwrap_or_default());
+    print!("{}", arguments.observers.write_latencies(&telemetry, &report)?);
     result?;
-    print!("{}", recorded_lines(&recorded?));
+    left?;
     Ok(closed?)
 }
 
@@ -120,44 +126,10 @@ impl RunArguments {
 fn control(
     controller: &mut Controller,
     status: &mut StatusLine,
-    recorder: Option<&mut Recorder>,
+    observers: &mut Observers,
     stop: &AtomicBool,
 ) -> Result<Ended, ControllerError> {
-    let mut observers: Vec<&mut dyn TickObserver> = vec![status];
-    if let Some(recorder) = recorder {
-        observers.push(recorder);
-    }
-    controller.run(stop, &mut observers)
-}
-
-fn start_recorder(
-    arguments: &RunArguments,
-    bundle: &Bundle,
-    engine: EngineSettings,
-) -> anyhow::Result<Option<Recorder>> {
-    let Some(folder) = &arguments.record else { return Ok(None) };
-    Ok(Some(Recorder::start(folder, arguments.record_episodes, bundle, engine)?))
-}
-
-fn finish_recorder(recorder: Option<Recorder>) -> anyhow::Result<Recorded> {
-    let Some(recorder) = recorder else { return Ok(Recorded::default()) };
-    let bar = indicatif::ProgressBar::new_spinner().with_message("writing films and episodes");
-    bar.enable_steady_tick(Duration::from_millis(200));
-    let recorded = recorder.finish()?;
-    bar.finish_and_clear();
-    Ok(recorded)
-}
-
-fn recorded_lines(recorded: &Recorded) -> String {
-    let mut text = String::new();
-    for path in recorded.films.iter().chain(&recorded.episodes) {
-        text += &format!("recorded   {}\n", path.display());
-    }
-    if recorded.broken_episodes > 0 {
-        text += &format!(
-            "recorded   {} episode(s) without .npz: observations of them were lost\n",
-            recorded.broken_episodes
-        );
-    }
-    text
+    let mut all: Vec<&mut dyn TickObserver> = vec![status];
+    all.extend(observers.all());
+    controller.run(stop, &mut all)
 }

@@ -40,7 +40,7 @@ pub mod inputs {
 }
 
 /// What is done to the graph beside cutting it; each can be left out to see what it brings.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, serde::Serialize)]
+#[derive(Debug, Clone, Copy, PartialEq, Eq, serde::Serialize, serde::Deserialize)]
 pub struct Optimizations {
     /// LayerNorm and `SiLU` as one node.
     pub norms: bool,

@@ -3,12 +3,12 @@
 use std::str::FromStr;
 
 use rcwm_models::ACTION_LEN;
-use serde::Serialize;
+use serde::{Deserialize, Serialize};
 
 use crate::policy::ActionLimits;
 
 /// What is sent when the policy has nothing fit to send.
-#[derive(Debug, Clone, Copy, PartialEq, Serialize)]
+#[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
 #[serde(rename_all = "lowercase")]
 pub enum Fallback {
     /// The last action that was sent in this episode; zeros before the first.

@@ -299,6 +299,12 @@ impl Controller {
         }
     }
 
+    /// Latencies so far.
+    #[must_use]
+    pub fn telemetry(&self) -> &Telemetry {
+        &self.telemetry
+    }
+
     /// Tells the simulator that no further action will come.
     ///
     /// # Errors

@@ -124,7 +124,9 @@ pub struct EpisodeResult {
 }
 
 impl EpisodeResult {
-    pub(super) fn start(observation: &Observation) -> Self {
+    /// An episode that begins with this observation, which is not counted yet.
+    #[must_use]
+    pub fn start(observation: &Observation) -> Self {
         Self {
             episode: observation.episode,
             task: task_name(observation.task),

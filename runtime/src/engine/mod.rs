@@ -9,12 +9,12 @@ mod tract;
 pub(crate) mod weights;
 
 use rcwm_models::bundle::{Bundle, DType, PartName, TensorSpec};
-use serde::Serialize;
+use serde::{Deserialize, Serialize};
 
 use crate::compile::Optimizations;
 
 /// Which engine.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, Hash, Serialize, clap::ValueEnum)]
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Hash, Serialize, Deserialize, clap::ValueEnum)]
 #[serde(rename_all = "lowercase")]
 pub enum EngineKind {
     /// tract, compiled in.
@@ -41,7 +41,7 @@ impl std::fmt::Display for EngineKind {
 }
 
 /// What is run of a bundle.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize)]
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "snake_case")]
 pub enum Form {
     /// The parts as exported, one after another once the image is there.
@@ -51,7 +51,7 @@ pub enum Form {
 }
 
 /// Which engine, and how much of the machine it may use.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize)]
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
 pub struct EngineSettings {
     /// Which engine.
     pub kind: EngineKind,

@@ -12,6 +12,7 @@
 //! mean, std       = actor(z^R, h^R, z^E, h^E)
 //! ```
 
+mod calls;
 mod compiled;
 mod limits;
 mod noise;
@@ -21,18 +22,21 @@ mod stages;
 mod state;
 mod tick;
 
+pub use calls::{CALLS_MAX, Call, CallKind, CallOutcome};
 pub use limits::ActionLimits;
 pub use noise::Sampling;
 pub use parts::{BranchBuffers, Buffers};
 pub use state::{BranchState, State};
 
 use std::path::Path;
+use std::time::Instant;
 
 use rcwm_models::bundle::{Bundle, BundleError, Manifest, PartName};
 use rcwm_models::{ACTION_LEN, IMAGE_BYTES};
 
 use crate::compile::CompileError;
 use crate::engine::{EngineError, EngineSettings};
+use calls::CallRing;
 use noise::NoiseSource;
 use stages::StageClock;
 use tick::Tick;
@@ -70,7 +74,7 @@ pub const STAGES: [PartName; 5] = PartName::REQUIRED;
 
 /// How far what was observed is from what was expected, per branch: `KL[q || p]` of posterior against prior in nats, summed over
 /// the categoricals. The robot's says "my arm does not move as I expect", the environment's "the scene changed".
-#[derive(Debug, Clone, Copy, PartialEq, Default, serde::Serialize)]
+#[derive(Debug, Clone, Copy, PartialEq, Default, serde::Serialize, serde::Deserialize)]
 pub struct Surprise {
     /// Robot branch.
     pub robot: f32,
@@ -115,6 +119,7 @@ pub struct Policy {
     noise: NoiseSource,
     /// What the buffers hold the work ahead for.
     ahead: Option<Before>,
+    calls: CallRing,
 }
 
 impl Policy {
@@ -142,6 +147,7 @@ impl Policy {
             noise: NoiseSource::new(sampling, model),
             manifest: bundle.manifest.clone(),
             ahead: None,
+            calls: CallRing::new(),
         };
         policy.warm_up(sampling)?;
         Ok(policy)
@@ -159,6 +165,7 @@ impl Policy {
         }
         self.noise = NoiseSource::new(sampling, &self.manifest.model);
         self.ahead = None;
+        self.calls = CallRing::new();
         self.reset();
         Ok(())
     }
@@ -172,6 +179,16 @@ impl Policy {
     /// [`PolicyError::Observation`], [`PolicyError::Engine`] or [`PolicyError::NotFinite`]; the carried state is then that of
     /// the last good tick.
     pub fn observe(
+        &mut self,
+        image: &[u8],
+        executed_action: Option<&[f32; ACTION_LEN]>,
+    ) -> Result<Decision, PolicyError> {
+        let result = self.observe_unnoted(image, executed_action);
+        self.calls.note(CallKind::Observe, executed_action, (&result).into());
+        result
+    }
+
+    fn observe_unnoted(
         &mut self,
         image: &[u8],
         executed_action: Option<&[f32; ACTION_LEN]>,
@@ -204,6 +221,14 @@ impl Policy {
     /// # Errors
     /// As [`Self::observe`].
     pub fn work_ahead(&mut self, action: Option<&[f32; ACTION_LEN]>) -> Result<(), PolicyError> {
+        let start = Instant::now();
+        let result = self.work_ahead_unnoted(action);
+        let outcome = CallOutcome::of_work_ahead(&result, start.elapsed().as_nanos() as u64);
+        self.calls.note(CallKind::WorkAhead, action, outcome);
+        result
+    }
+
+    fn work_ahead_unnoted(&mut self, action: Option<&[f32; ACTION_LEN]>) -> Result<(), PolicyError> {
         let before = Self::before(action)?;
         if before == Before::Start {
             self.reset();
@@ -222,6 +247,12 @@ impl Policy {
     /// # Errors
     /// As [`Self::observe`].
     pub fn imagine(&mut self, executed_action: &[f32; ACTION_LEN]) -> Result<Decision, PolicyError> {
+        let result = self.imagine_unnoted(executed_action);
+        self.calls.note(CallKind::Imagine, Some(executed_action), (&result).into());
+        result
+    }
+
+    fn imagine_unnoted(&mut self, executed_action: &[f32; ACTION_LEN]) -> Result<Decision, PolicyError> {
         let before = Self::before(Some(executed_action))?;
         let mut clock = StageClock::start();
         let recomputed = self.prepare(before, &mut clock)?;
@@ -296,6 +327,7 @@ impl Policy {
         }
         self.state.clone_from(state);
         self.ahead = None;
+        self.calls.note(CallKind::SetState, None, CallOutcome::StateSet { checksum: state.checksum() });
         Ok(())
     }
 
@@ -313,6 +345,35 @@ impl Policy {
     pub fn set_noise(&mut self, robot: &[f32], environment: &[f32]) -> Result<(), PolicyError> {
         self.ahead = None;
         self.noise.set(robot, environment)
+    }
+
+    /// A number that no other policy of this process has.
+    #[must_use]
+    pub fn number(&self) -> u64 {
+        self.calls.policy()
+    }
+
+    /// Calls of [`Self::observe`], [`Self::imagine`], [`Self::work_ahead`] and [`Self::set_state`] so far.
+    #[must_use]
+    pub fn calls_made(&self) -> u64 {
+        self.calls.made()
+    }
+
+    /// The calls from number `first` on; at most the last [`CALLS_MAX`] are remembered.
+    pub fn calls_since(&self, first: u64) -> impl Iterator<Item = &Call> {
+        self.calls.since(first)
+    }
+
+    /// Where the generator of [`Sampling::Sample`] stands before what the next tick draws; 0 without one.
+    #[must_use]
+    pub fn noise_position(&self) -> u128 {
+        self.noise.position(self.ahead.is_some())
+    }
+
+    /// Goes on drawing from there; what was worked ahead is forgotten.
+    pub fn set_noise_position(&mut self, position: u128) {
+        self.ahead = None;
+        self.noise.set_position(position);
     }
 
     /// The bundle's manifest.

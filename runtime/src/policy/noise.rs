@@ -8,7 +8,8 @@ use rcwm_models::settings::ModelSettings;
 use super::PolicyError;
 
 /// How latents and actions are chosen.
-#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+#[derive(Debug, Clone, Copy, PartialEq, Eq, serde::Serialize, serde::Deserialize)]
+#[serde(rename_all = "lowercase")]
 pub enum Sampling {
     /// The most probable classes and the mean action.
     Mode,
@@ -22,6 +23,8 @@ pub enum Sampling {
 /// The noise of the current tick and where the next comes from.
 pub(super) struct NoiseSource {
     rng: Option<ChaCha8Rng>,
+    /// Where the generator stood before the current tick's draw.
+    drawn_from: u128,
     /// Robot's, then the environment's: each prior's, then posterior's, `[2, n, m]`.
     robot: Vec<f32>,
     environment: Vec<f32>,
@@ -34,15 +37,31 @@ impl NoiseSource {
             Sampling::Sample { seed } => Some(ChaCha8Rng::seed_from_u64(seed)),
         };
         let zeros = vec![0.0; 2 * model.stoch_width()];
-        Self { rng, robot: zeros.clone(), environment: zeros }
+        Self { rng, drawn_from: 0, robot: zeros.clone(), environment: zeros }
     }
 
     /// Fresh Gumbel noise for a tick; nothing when the mode is wanted.
     pub(super) fn draw(&mut self) {
         if let Some(rng) = &mut self.rng {
+            self.drawn_from = rng.get_word_pos();
             for value in self.robot.iter_mut().chain(&mut self.environment) {
                 *value = gumbel(rng);
             }
+        }
+    }
+
+    /// Where the generator stands, or stood before the last draw.
+    pub(super) fn position(&self, before_draw: bool) -> u128 {
+        match &self.rng {
+            None => 0,
+            Some(_) if before_draw => self.drawn_from,
+            Some(rng) => rng.get_word_pos(),
+        }
+    }
+
+    pub(super) fn set_position(&mut self, position: u128) {
+        if let Some(rng) = &mut self.rng {
+            rng.set_word_pos(position);
         }
     }
 

@@ -33,6 +33,17 @@ impl From<&InitialState> for State {
 }
 
 impl State {
+    /// CRC-32C over the bits of z and h of both branches, to tell the states of one run apart.
+    #[must_use]
+    pub fn checksum(&self) -> u32 {
+        let branches = [&self.robot, &self.environment];
+        branches.into_iter().fold(0, |sum, branch| {
+            let sum =
+                branch.z.iter().fold(sum, |sum, class| crc32c::crc32c_append(sum, &class.to_le_bytes()));
+            branch.h.iter().fold(sum, |sum, value| crc32c::crc32c_append(sum, &value.to_le_bytes()))
+        })
+    }
+
     /// Takes over posterior z and h of the tick that is in the buffers. Copies, allocates nothing.
     pub(super) fn take_posterior(&mut self, buffers: &Buffers) {
         for (state, branch) in
@@ -47,5 +58,19 @@ impl State {
         let sizes =
             |s: &Self| [s.robot.z.len(), s.robot.h.len(), s.environment.z.len(), s.environment.h.len()];
         sizes(self) == sizes(other)
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn the_checksum_tells_the_sign_of_zero_and_the_branches_apart() {
+        let branch = |h: f32| BranchState { z: vec![1, 2], h: vec![h, 0.5] };
+        let state = |robot, environment| State { robot: branch(robot), environment: branch(environment) };
+        let sums = [state(0.0, 1.0), state(-0.0, 1.0), state(1.0, 0.0)].map(|state| state.checksum());
+        assert_eq!(sums[0], state(0.0, 1.0).checksum());
+        assert!(sums[0] != sums[1] && sums[0] != sums[2] && sums[1] != sums[2]);
     }
 }

@@ -1,12 +1,31 @@
-//! Latency histograms, one per stage.
+//! Latency histograms, one per stage; snapshots of them while a run goes on, files and plots of them at its end.
 //!
 //! Times are kept in nanoseconds with three significant digits up to one minute, so that a recording never allocates and never
 //! fails; they are reported in microseconds.
+//!
+//! | file | holds |
+//! | --- | --- |
+//! | `snapshot` | a JSON line every so often: counts, percentiles and surprise of the last interval and in total |
+//! | `hgrm` | HdrHistogram's percentile files, for the usual plotters |
+//! | `plot` | latency by percentile as a picture |
+//! | `files` | the options that ask for them |
+
+mod files;
+mod hgrm;
+mod plot;
+mod recent;
+mod snapshot;
+
+pub use files::LatencyFiles;
+pub use plot::{Curve, PlotError, plot};
+pub use recent::RECENT_MAX;
+pub use snapshot::{SnapshotError, SnapshotSettings, Snapshots};
 
 use hdrhistogram::Histogram;
 use serde::Serialize;
 
 use crate::policy::STAGES;
+use recent::Recent;
 
 /// Longest time told apart, in ns.
 const TIME_NS_MAX: u64 = 60_000_000_000;
@@ -83,8 +102,10 @@ impl Stage {
 }
 
 /// One histogram per stage.
+#[derive(Clone)]
 pub struct Telemetry {
     histograms: [Histogram<u64>; Stage::ALL.len()],
+    recent: Recent,
 }
 
 impl Default for Telemetry {
@@ -98,12 +119,30 @@ impl Telemetry {
     #[must_use]
     pub fn new() -> Self {
         let empty = Histogram::new_with_bounds(1, TIME_NS_MAX, 3).expect("the bounds are constants that fit");
-        Self { histograms: std::array::from_fn(|_| empty.clone()) }
+        Self { histograms: std::array::from_fn(|_| empty.clone()), recent: Recent::new() }
     }
 
     /// Records a time; one over a minute counts as a minute.
     pub fn record(&mut self, stage: Stage, time_ns: u64) {
         self.histograms[stage as usize].saturating_record(time_ns);
+        self.recent.note(stage, time_ns);
+    }
+
+    /// Every time recorded for a stage, in ns.
+    #[must_use]
+    pub fn histogram(&self, stage: Stage) -> &Histogram<u64> {
+        &self.histograms[stage as usize]
+    }
+
+    /// Recordings so far, of all stages.
+    #[must_use]
+    pub fn recorded(&self) -> u64 {
+        self.recent.noted()
+    }
+
+    /// The recordings from number `first` on, in ns; at most the last [`RECENT_MAX`] are remembered.
+    pub fn recorded_since(&self, first: u64) -> impl Iterator<Item = (Stage, u64)> {
+        self.recent.since(first)
     }
 
     /// What was recorded for a stage.

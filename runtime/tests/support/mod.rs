@@ -165,9 +165,29 @@ fn start<T: Send + 'static>(
     fallback: Fallback,
     run: impl FnOnce(&mut Controller) -> T + Send + 'static,
 ) -> JoinHandle<T> {
-    let policy = Policy::load(bundle, EngineSettings::tract()).unwrap();
-    let first_timeout = Some(NEVER);
-    let settings = ControllerSettings { first_timeout, fallback, ..ControllerSettings::new(link.0.clone()) };
+    start_with(Policy::load(bundle, EngineSettings::tract()).unwrap(), link, fallback, run)
+}
+
+/// Starts a controller of a policy in another thread.
+pub fn start_with<T: Send + 'static>(
+    policy: Policy,
+    link: &OwnLink,
+    fallback: Fallback,
+    run: impl FnOnce(&mut Controller) -> T + Send + 'static,
+) -> JoinHandle<T> {
+    start_changed(policy, link, |settings| settings.fallback = fallback, run)
+}
+
+/// The same with changed settings.
+pub fn start_changed<T: Send + 'static>(
+    policy: Policy,
+    link: &OwnLink,
+    change: impl FnOnce(&mut ControllerSettings),
+    run: impl FnOnce(&mut Controller) -> T + Send + 'static,
+) -> JoinHandle<T> {
+    let mut settings =
+        ControllerSettings { first_timeout: Some(NEVER), ..ControllerSettings::new(link.0.clone()) };
+    change(&mut settings);
     std::thread::spawn(move || run(&mut Controller::open(policy, settings).unwrap()))
 }
 

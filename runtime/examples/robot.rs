@@ -1,0 +1,134 @@
+//! A robot of your own on the wire: it publishes what it sees, and executes what the controller answers.
+//!
+//! ```text
+//! rcwm-runtime run --bundle models/bundles/untrained --instance mine &
+//! cargo run --release -p rcwm-runtime --example robot -- --instance mine --rate-hz 40
+//! ```
+//!
+//! Replace `Table` by your robot: an upright 64 x 64 RGB picture, and four numbers in [-1, 1].
+
+mod table;
+
+use std::time::{Duration, Instant};
+
+use anyhow::Context;
+use clap::Parser;
+use rcwm_models::ACTION_LEN;
+use rcwm_models::tasks::OWN_TASK;
+use rcwm_models::wire::clock::monotonic_ns;
+use rcwm_models::wire::{Action, LinkSettings, Observation, ObservationFlags, SimulatorLink, Wait};
+use table::Table;
+
+/// A hand that slides over a table.
+#[derive(Debug, Parser)]
+struct Arguments {
+    /// The name given to the controller
+    #[arg(long)]
+    instance: String,
+    /// Episodes
+    #[arg(long, default_value_t = 2)]
+    episodes: u64,
+    /// Observations an episode
+    #[arg(long, default_value_t = 50)]
+    steps: u32,
+    /// Steps a second; 0 waits for every answer
+    #[arg(long, default_value_t = 0.0)]
+    rate_hz: f64,
+    /// Longest wait for an answer, in seconds
+    #[arg(long, default_value_t = 60.0)]
+    timeout_s: f64,
+}
+
+fn main() -> anyhow::Result<()> {
+    let arguments = Arguments::parse();
+    let link = SimulatorLink::open(LinkSettings::new(&arguments.instance))?;
+    let period_ns = if arguments.rate_hz > 0.0 { (1e9 / arguments.rate_hz) as u64 } else { 0 };
+    let mut robot =
+        Robot { link, period_ns, due_ns: 0, sequence: 0, held: 0, timeout_s: arguments.timeout_s };
+    for episode in 0..arguments.episodes {
+        let total_reward = robot.episode(episode, arguments.steps)?;
+        println!("episode {episode}: {} observations, reward {total_reward:.2}", arguments.steps);
+    }
+    println!("{} observations, {} of them without an answer in time", robot.sequence, robot.held);
+    Ok(robot.link.close()?)
+}
+
+struct Robot {
+    link: SimulatorLink,
+    /// 0 waits for every answer.
+    period_ns: u64,
+    /// When the next observation is due.
+    due_ns: u64,
+    sequence: u64,
+    /// Steps on which no answer had come in time.
+    held: u64,
+    timeout_s: f64,
+}
+
+impl Robot {
+    fn episode(&mut self, episode: u64, steps: u32) -> anyhow::Result<f64> {
+        let mut table = Table::new(episode);
+        let mut executed = [0.0; ACTION_LEN];
+        let (mut total_reward, mut held) = (0.0, false);
+        for step in 0..steps {
+            let mut observation = Observation::zeroed();
+            observation.sequence = self.sequence;
+            (observation.episode, observation.step, observation.task) = (episode, step, OWN_TASK);
+            observation.flags = ObservationFlags::default()
+                .with(ObservationFlags::FIRST, step == 0)
+                .with(ObservationFlags::LAST, step + 1 == steps)
+                .with(ObservationFlags::ACTION_HELD, held)
+                .0;
+            observation.reward = if step == 0 { 0.0 } else { table.reward() };
+            observation.executed_action = executed;
+            observation.image = table.picture();
+            total_reward += f64::from(observation.reward);
+            let answer = self.ask(observation)?;
+            held = answer.is_none();
+            self.held += u64::from(held);
+            // Without an answer the last action goes on. What is no number is never executed, whoever sent it.
+            let action = answer.map_or(executed, |answer| answer.action);
+            executed =
+                table.step(action.map(|value| if value.is_finite() { value.clamp(-1.0, 1.0) } else { 0.0 }));
+        }
+        Ok(total_reward)
+    }
+
+    /// Publishes an observation and waits for its answer: to the end of the period, or as long as it takes.
+    fn ask(&mut self, mut observation: Observation) -> anyhow::Result<Option<Action>> {
+        self.sequence += 1;
+        observation.period_ns = self.period_ns;
+        observation.scheduled_ns = self.due_ns.max(monotonic_ns());
+        // The first of all waits for a controller: the clock starts with its answer.
+        let waits = self.period_ns == 0 || observation.sequence == 0;
+        self.due_ns = observation.scheduled_ns + self.period_ns;
+        self.link.publish(|slot| *slot = observation)?;
+        let start = Instant::now();
+        let mut answer = None;
+        loop {
+            let left = if waits {
+                Duration::from_secs_f64(self.timeout_s).saturating_sub(start.elapsed())
+            } else {
+                Duration::from_nanos(self.due_ns.saturating_sub(monotonic_ns()))
+            };
+            if left.is_zero() {
+                break;
+            }
+            match self.link.wait_action(left)? {
+                (Wait::Message(action), _) if action.answers == observation.sequence => answer = Some(action),
+                // A controller that has just connected has not seen it.
+                (Wait::TimedOut, events) if events.hello => {
+                    observation.flags |= ObservationFlags::REPEATED.0;
+                    self.link.publish(|slot| *slot = observation)?;
+                }
+                _ => {}
+            }
+            if waits && answer.is_some() {
+                self.due_ns = monotonic_ns() + self.period_ns;
+                return Ok(answer);
+            }
+        }
+        let silent = || format!("no answer within {} s: is a controller running?", self.timeout_s);
+        if waits { answer.with_context(silent).map(Some) } else { Ok(answer) }
+    }
+}

@@ -1,0 +1,173 @@
+//! What looks on while `run` goes on, and what it leaves behind: films, a log, snapshots, latencies.
+
+use std::path::PathBuf;
+use std::time::Duration;
+
+use clap::Args;
+use rcwm_models::bundle::Bundle;
+
+use crate::controller::{Pace, RunReport, TickObserver};
+use crate::log::{LogSettings, LogSummary, Logger};
+use crate::policy::Policy;
+use crate::record::{Recorded, Recorder};
+use crate::telemetry::{LatencyFiles, SnapshotSettings, Snapshots, Telemetry};
+
+/// What is to be written.
+#[derive(Debug, Args)]
+pub(super) struct ObserverArguments {
+    /// Records films, strips and episodes into this folder
+    #[arg(long, value_name = "DIR")]
+    record: Option<PathBuf>,
+    /// Records at most this many episodes
+    #[arg(long, value_name = "N", default_value_t = 3)]
+    record_episodes: u64,
+    /// Logs every tick to this file, for `rcwm-runtime replay`; it must not exist yet
+    #[arg(long, value_name = "FILE")]
+    log: Option<PathBuf>,
+    /// Appends a JSON line to this file every so often: counts, latencies and surprise of the last interval and in total
+    #[arg(long, value_name = "FILE")]
+    telemetry: Option<PathBuf>,
+    /// Time between two of these lines, as in 500ms, 1s or 2m
+    #[arg(long, value_name = "TIME", default_value = "1s", value_parser = interval)]
+    telemetry_every: Duration,
+    #[command(flatten)]
+    latency_files: LatencyFiles,
+}
+
+/// A time from a millisecond to a day.
+fn interval(text: &str) -> Result<Duration, String> {
+    let end = text.find(|letter: char| letter.is_ascii_alphabetic()).unwrap_or(text.len());
+    let unit_s = match &text[end..] {
+        "ms" => 1e-3,
+        "s" | "" => 1.0,
+        "m" | "min" => 60.0,
+        "h" => 3600.0,
+        _ => return Err("expected a number and ms, s, m or h".into()),
+    };
+    match text[..end].trim().parse::<f64>().map(|number| number * unit_s) {
+        Ok(value_s) if (1e-3..=86_400.0).contains(&value_s) => Ok(Duration::from_secs_f64(value_s)),
+        _ => Err("expected 1ms to 24h".into()),
+    }
+}
+
+/// Everything that looks on.
+pub(super) struct Observers {
+    recorder: Option<Recorder>,
+    logger: Option<Logger>,
+    snapshots: Option<Snapshots>,
+}
+
+/// What they have left behind.
+pub(super) struct Left {
+    recorded: Recorded,
+    log: Option<LogSummary>,
+}
+
+impl Observers {
+    pub(super) fn start(
+        arguments: &ObserverArguments,
+        bundle: &Bundle,
+        policy: &Policy,
+        log: LogSettings,
+    ) -> anyhow::Result<Self> {
+        let recorder = match &arguments.record {
+            Some(folder) => Some(Recorder::start(folder, arguments.record_episodes, bundle, log.engine)?),
+            None => None,
+        };
+        let logger = match &arguments.log {
+            Some(file) => Some(Logger::start(file, policy, log)?),
+            None => None,
+        };
+        let every = arguments.telemetry_every;
+        let snapshots =
+            arguments.telemetry.clone().map(|file| Snapshots::start(SnapshotSettings { file, every }));
+        Ok(Self { recorder, logger, snapshots: snapshots.transpose()? })
+    }
+
+    pub(super) fn all(&mut self) -> impl Iterator<Item = &mut dyn TickObserver> {
+        fn observer<T: TickObserver>(one: &mut T) -> &mut dyn TickObserver {
+            one
+        }
+        let Self { recorder, logger, snapshots } = self;
+        let all = [
+            recorder.as_mut().map(observer),
+            logger.as_mut().map(observer),
+            snapshots.as_mut().map(observer),
+        ];
+        all.into_iter().flatten()
+    }
+
+    pub(super) fn frames_dropped(&self) -> u64 {
+        self.recorder.as_ref().map_or(0, Recorder::dropped)
+    }
+
+    /// Waits until everything is written; the first error is told after all have ended.
+    pub(super) fn finish(self) -> anyhow::Result<Left> {
+        let bar = indicatif::ProgressBar::new_spinner().with_message("writing what was recorded");
+        bar.enable_steady_tick(Duration::from_millis(200));
+        let log = self.logger.map(Logger::finish).transpose();
+        let snapshots = self.snapshots.map(Snapshots::finish).transpose();
+        let recorded = self.recorder.map_or_else(|| Ok(Recorded::default()), Recorder::finish);
+        bar.finish_and_clear();
+        snapshots?;
+        Ok(Left { log: log?, recorded: recorded? })
+    }
+}
+
+impl Left {
+    /// One line for people of each thing that was written.
+    pub(super) fn lines(&self) -> String {
+        let Recorded { films, episodes, broken_episodes } = &self.recorded;
+        let mut text = String::new();
+        for path in films.iter().chain(episodes) {
+            text += &format!("recorded   {}\n", path.display());
+        }
+        if *broken_episodes > 0 {
+            text += &format!(
+                "recorded   {broken_episodes} episode(s) without .npz: observations of them were lost\n"
+            );
+        }
+        if let Some(LogSummary { file, ticks, dropped, bytes }) = &self.log {
+            let mib = *bytes as f64 / f64::from(1 << 20);
+            text +=
+                &format!("logged     {}: {ticks} ticks, {dropped} dropped, {mib:.1} MiB\n", file.display());
+        }
+        text
+    }
+}
+
+impl ObserverArguments {
+    /// Writes and draws the latencies of a run; gives a line for people of each file.
+    pub(super) fn write_latencies(
+        &self,
+        telemetry: &Telemetry,
+        report: &RunReport,
+    ) -> anyhow::Result<String> {
+        let RunReport { preset, bundle_task, engine, counters, pace, .. } = report;
+        if counters.observations == 0 {
+            return Ok(String::new());
+        }
+        let period_us = match pace {
+            Some(Pace::Realtime { rate_hz }) => Some(1e6 / rate_hz),
+            _ => None,
+        };
+        let title = format!(
+            "{preset} bundle for {bundle_task}, engine {engine}: {} observations",
+            counters.observations
+        );
+        self.latency_files.write(telemetry, &title, period_us)?;
+        Ok(self.latency_files.lines())
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn intervals_are_understood_with_their_units() {
+        let ms = |text| interval(text).map(|interval| interval.as_millis());
+        assert_eq!([ms("500ms"), ms("1s"), ms("2"), ms("1.5m")], [500, 1000, 2000, 90_000].map(Ok));
+        assert!(["0s", "-1s", "1 parsec", "", "25h"].into_iter().all(|text| interval(text).is_err()));
+    }
+}

@@ -1,0 +1,138 @@
+//! `rcwm-runtime replay`.
+
+use std::path::PathBuf;
+use std::sync::atomic::{AtomicBool, Ordering};
+
+use anyhow::Context;
+use clap::Args;
+use serde::Serialize;
+
+use crate::engine::{EngineKind, EngineSettings};
+use crate::log::{BundleIdentity, LogReader, ReplayReport, Replayer, WrittenEpisodes, write_episodes};
+use crate::telemetry::LatencyFiles;
+
+/// Arguments of `replay`.
+#[derive(Debug, Args)]
+#[command(after_help = "Examples:\n  \
+    rcwm-runtime run --bundle models/bundles/debug --instance demo --log runs/demo.rcwmlog\n  \
+    rcwm-runtime replay --log runs/demo.rcwmlog --bundle models/bundles/debug --json replay.json\n  \
+    rcwm-runtime replay --log runs/demo.rcwmlog --episodes data\n\n\
+    Every call of the policy is made again on the logged inputs, with the logged engine, sampling and seed. Actions, surprise and\n\
+    the digest of the state must be the same bit for bit; the first difference is an error. Another engine or another\n\
+    processor may round otherwise. A log that was cut is replayed up to the cut.")]
+pub(super) struct ReplayArguments {
+    /// The log
+    #[arg(long, value_name = "FILE")]
+    log: PathBuf,
+    /// The bundle's folder; again for each bundle that took over while the run went on
+    #[arg(long, value_name = "DIR", required_unless_present = "episodes")]
+    bundle: Vec<PathBuf>,
+    /// Engine; the log's own unless given
+    #[arg(long, value_enum)]
+    engine: Option<EngineKind>,
+    /// Writes the logged episodes into this folder as Dreamer's .npz files, one sub-folder a task
+    #[arg(long, value_name = "DIR")]
+    episodes: Option<PathBuf>,
+    #[command(flatten)]
+    latency_files: LatencyFiles,
+    /// Writes everything to this file as JSON
+    #[arg(long, value_name = "FILE")]
+    json: Option<PathBuf>,
+}
+
+#[derive(Serialize)]
+struct Report {
+    #[serde(flatten)]
+    replay: Option<ReplayReport>,
+    #[serde(skip_serializing_if = "Option::is_none")]
+    episodes: Option<WrittenEpisodes>,
+}
+
+pub(super) fn run(arguments: &ReplayArguments) -> anyhow::Result<()> {
+    let stop = super::stop_flag()?;
+    let replay = if arguments.bundle.is_empty() { None } else { Some(replay(arguments, &stop)?) };
+    let episodes = match &arguments.episodes {
+        Some(folder) if !stop.load(Ordering::Relaxed) => Some(write(arguments, folder, &stop)?),
+        _ => None,
+    };
+    if let Some(report) = &replay {
+        print!("{}", report.text());
+    }
+    if let Some(written) = &episodes {
+        print!("{}", episode_lines(written));
+    }
+    let damage = replay.as_ref().and_then(|report| report.log_damage.clone());
+    let damage = damage.or_else(|| episodes.as_ref().and_then(|written| written.log_damage.clone()));
+    let difference = replay.as_ref().and_then(|report| report.first_difference.clone());
+    super::write_json(arguments.json.as_ref(), &Report { replay, episodes })?;
+    match (difference, damage) {
+        (Some(difference), _) => anyhow::bail!("the replay differs first at {difference}"),
+        (None, Some(damage)) => anyhow::bail!(damage),
+        (None, None) => Ok(()),
+    }
+}
+
+fn replay(arguments: &ReplayArguments, stop: &AtomicBool) -> anyhow::Result<ReplayReport> {
+    for folder in &arguments.bundle {
+        super::open_bundle(folder)?;
+    }
+    let mut log = LogReader::open(&arguments.log)?;
+    let engine = arguments.engine.filter(|kind| *kind != log.header().engine.kind);
+    let engine = engine.map(EngineSettings::single_threaded);
+    let mut replayer = Replayer::new(log.header(), &arguments.bundle, engine)?;
+    let report = with_bar(stop, "replaying", |go_on| replayer.run(&mut log, go_on)).context("replaying")?;
+    let BundleIdentity { preset, task, .. } = &report.log.bundle;
+    let title =
+        format!("{preset} bundle for {task}, engine {}: {} replayed ticks", report.engine.kind, report.ticks);
+    if report.ticks_compared > 0 {
+        arguments.latency_files.write(replayer.telemetry(), &title, None)?;
+    }
+    Ok(report)
+}
+
+fn write(
+    arguments: &ReplayArguments,
+    folder: &std::path::Path,
+    stop: &AtomicBool,
+) -> anyhow::Result<WrittenEpisodes> {
+    let mut log = LogReader::open(&arguments.log)?;
+    with_bar(stop, "writing episodes", |go_on| write_episodes(&mut log, folder, go_on))
+        .context("writing episodes")
+}
+
+/// Runs `work` with a bar over the log's bytes.
+fn with_bar<T>(
+    stop: &AtomicBool,
+    what: &'static str,
+    work: impl FnOnce(&mut dyn FnMut((u64, u64)) -> bool) -> T,
+) -> T {
+    let bar = super::progress_bar(0, what);
+    let mut entries: u64 = 0;
+    let result = work(&mut |(read, bytes)| {
+        entries += 1;
+        // Drawing costs time that would disturb the next tick.
+        if entries.is_multiple_of(64) {
+            bar.set_length(bytes);
+            bar.set_position(read);
+        }
+        !stop.load(Ordering::Relaxed)
+    });
+    bar.finish_and_clear();
+    result
+}
+
+fn episode_lines(written: &WrittenEpisodes) -> String {
+    let WrittenEpisodes { files, steps, left_out, .. } = written;
+    let mut text = format!("episodes   {} written, {steps} steps", files.len());
+    if *left_out > 0 {
+        text += &format!("; {left_out} left out: observations of them were lost");
+    }
+    text.push('\n');
+    for file in files.iter().take(5) {
+        text += &format!("  {}\n", file.display());
+    }
+    if files.len() > 5 {
+        text += &format!("  ... {} more\n", files.len() - 5);
+    }
+    text
+}

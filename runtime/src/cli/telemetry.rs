@@ -1,0 +1,51 @@
+//! `rcwm-runtime telemetry`.
+
+use std::path::PathBuf;
+use std::sync::atomic::Ordering;
+
+use clap::Args;
+
+use crate::log::{LogReader, LoggedLatencies};
+use crate::telemetry::LatencyFiles;
+
+/// Arguments of `telemetry`.
+#[derive(Debug, Args)]
+#[command(after_help = "Examples:\n  \
+    rcwm-runtime run --bundle models/bundles/debug --instance demo --log runs/demo.rcwmlog\n  \
+    rcwm-runtime telemetry --log runs/demo.rcwmlog --hgrm runs/hgrm --plot runs/latency.png\n\n\
+    A run writes the same files with its own --hgrm and --plot, and snapshots while it goes on with --telemetry.")]
+pub(super) struct TelemetryArguments {
+    /// The log
+    #[arg(long, value_name = "FILE")]
+    log: PathBuf,
+    #[command(flatten)]
+    files: LatencyFiles,
+    /// Writes everything to this file as JSON
+    #[arg(long, value_name = "FILE")]
+    json: Option<PathBuf>,
+}
+
+pub(super) fn run(arguments: &TelemetryArguments) -> anyhow::Result<()> {
+    let stop = super::stop_flag()?;
+    let mut log = LogReader::open(&arguments.log)?;
+    let bar = super::progress_bar(0, "reading");
+    let latencies = LoggedLatencies::read(&mut log, &mut |(read, bytes)| {
+        bar.set_length(bytes);
+        bar.set_position(read);
+        !stop.load(Ordering::Relaxed)
+    })?;
+    bar.finish_and_clear();
+    print!("{}", latencies.text());
+    let header = log.header();
+    let title = format!(
+        "{} bundle for {}, engine {}: {} logged ticks",
+        header.bundle.preset, header.bundle.task, header.engine.kind, latencies.report.ticks
+    );
+    arguments.files.write(&latencies.telemetry, &title, latencies.report.period_us)?;
+    print!("{}", arguments.files.lines());
+    super::write_json(arguments.json.as_ref(), &latencies.report)?;
+    match latencies.report.log_damage {
+        Some(damage) => anyhow::bail!(damage),
+        None => Ok(()),
+    }
+}

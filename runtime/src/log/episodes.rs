@@ -1,0 +1,103 @@
+//! A log as Dreamer's episodes, so that what a deployed policy lived through is data for the trainer.
+
+use std::path::{Path, PathBuf};
+
+use rcwm_models::episode::EpisodeBuilder;
+use rcwm_models::tasks::task_name;
+use rcwm_models::wire::{Observation, ObservationFlags};
+
+use super::LogError;
+use super::reader::{Entry, LogReader};
+
+/// What came of a log.
+#[derive(Debug, Clone, PartialEq, Eq, Default, serde::Serialize)]
+pub struct WrittenEpisodes {
+    /// Files written: `FOLDER/TASK/log-00000.npz` and so on.
+    pub files: Vec<PathBuf>,
+    /// Steps in them.
+    pub steps: u64,
+    /// Episodes left out: observations of them were lost, or they are a single observation.
+    pub left_out: u64,
+    /// Where the log is damaged; all before it was used.
+    pub log_damage: Option<String>,
+}
+
+struct Running {
+    builder: EpisodeBuilder,
+    task: &'static str,
+    next_step: u32,
+    broken: bool,
+}
+
+/// Writes every episode of a log of which no observation was lost, one folder a task.
+///
+/// # Errors
+/// [`LogError::Io`] or [`LogError::Episode`].
+pub fn write_episodes(
+    log: &mut LogReader,
+    folder: &Path,
+    go_on: &mut dyn FnMut((u64, u64)) -> bool,
+) -> Result<WrittenEpisodes, LogError> {
+    let mut written = WrittenEpisodes::default();
+    let mut running: Option<Running> = None;
+    loop {
+        let entry = match log.read() {
+            Ok(Some(entry)) => entry,
+            Ok(None) => break,
+            Err(error @ LogError::Damaged { .. }) => {
+                written.log_damage = Some(error.to_string());
+                break;
+            }
+            Err(error) => return Err(error),
+        };
+        if let Entry::Tick(tick) = entry
+            && let Some(observation) = &tick.observation
+        {
+            if tick.record.is_first {
+                finish(running.take(), folder, &mut written)?;
+            }
+            let now = running.get_or_insert_with(|| Running::start(observation));
+            now.add(observation, tick.record.dropped_before > 0 && !tick.record.is_first);
+            if observation.is(ObservationFlags::LAST) {
+                finish(running.take(), folder, &mut written)?;
+            }
+        }
+        if !go_on(log.progress_bytes()) {
+            break;
+        }
+    }
+    finish(running, folder, &mut written)?;
+    Ok(written)
+}
+
+impl Running {
+    fn start(observation: &Observation) -> Self {
+        let task = task_name(observation.task);
+        Self { builder: EpisodeBuilder::new(), task, next_step: observation.step, broken: false }
+    }
+
+    fn add(&mut self, observation: &Observation, gap: bool) {
+        // A transition over a gap would teach the trainer a dynamics that does not exist.
+        self.broken |= gap || observation.step != self.next_step;
+        self.next_step = observation.step.wrapping_add(1);
+        if !self.broken {
+            self.broken = self.builder.push(observation).is_err();
+        }
+    }
+}
+
+fn finish(running: Option<Running>, folder: &Path, written: &mut WrittenEpisodes) -> Result<(), LogError> {
+    let Some(mut running) = running else { return Ok(()) };
+    let whole = running.builder.finish().filter(|episode| !running.broken && episode.len() > 1);
+    let Some(episode) = whole else {
+        written.left_out += 1;
+        return Ok(());
+    };
+    let folder = folder.join(running.task);
+    std::fs::create_dir_all(&folder).map_err(|source| LogError::Io { path: folder.clone(), source })?;
+    let path = folder.join(format!("log-{:05}.npz", written.files.len()));
+    episode.write(&path)?;
+    written.steps += episode.len() as u64;
+    written.files.push(path);
+    Ok(())
+}

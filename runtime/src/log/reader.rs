@@ -1,0 +1,157 @@
+//! Reading a log, up to its end or its first damage.
+
+use std::fs::File;
+use std::io::{BufReader, Read};
+use std::path::{Path, PathBuf};
+
+use rcwm_models::wire::Observation;
+
+use super::LogError;
+use super::frames::{FrameReader, MAGIC, Next, read_up_to};
+use super::pack::ImagePacker;
+use super::record::{BundleIdentity, Header, Record, TickRecord, VERSION};
+
+/// What a log holds, one after another.
+#[derive(Debug)]
+pub enum Entry {
+    /// A tick.
+    Tick(Box<LoggedTick>),
+    /// From here on another policy ran.
+    Policy(BundleIdentity),
+}
+
+/// A tick with its picture.
+#[derive(Debug)]
+pub struct LoggedTick {
+    /// Ticks before it in the log.
+    pub index: u64,
+    /// What was written.
+    pub record: TickRecord,
+    /// The observation, mask included; none where nothing came.
+    pub observation: Option<Observation>,
+}
+
+/// Reads a log from its beginning.
+pub struct LogReader {
+    path: PathBuf,
+    header: Header,
+    frames: FrameReader<BufReader<File>>,
+    images: ImagePacker,
+    ticks: u64,
+    bytes: u64,
+    finished: bool,
+    over: bool,
+}
+
+impl LogReader {
+    /// Opens a log and reads its header.
+    ///
+    /// # Errors
+    /// [`LogError::Io`], [`LogError::NotALog`], [`LogError::Version`] or [`LogError::Damaged`].
+    pub fn open(path: &Path) -> Result<Self, LogError> {
+        let io = |source| LogError::Io { path: path.to_path_buf(), source };
+        let no_log = |reason: String| LogError::NotALog { path: path.to_path_buf(), reason };
+        let file = File::open(path).map_err(io)?;
+        let bytes = file.metadata().map_err(io)?.len();
+        let mut file = BufReader::with_capacity(1 << 16, file);
+        let version = read_start(&mut file).map_err(io)?.map_err(no_log)?;
+        if version != VERSION {
+            return Err(LogError::Version { path: path.to_path_buf(), found: version, expected: VERSION });
+        }
+        let mut frames = FrameReader::new(file, MAGIC.len() as u64 + 4);
+        let header = match frames.next().map_err(io)? {
+            Next::Payload(payload) => {
+                serde_json::from_slice(payload).map_err(|error| no_log(error.to_string()))?
+            }
+            Next::End => return Err(no_log("it ends before its header".into())),
+            Next::Damaged(reason) => return Err(no_log(format!("its header is damaged: {reason}"))),
+        };
+        let path = path.to_path_buf();
+        let images = ImagePacker::new();
+        Ok(Self { path, header, frames, images, ticks: 0, bytes, finished: false, over: false })
+    }
+
+    /// What the run was made with.
+    #[must_use]
+    pub fn header(&self) -> &Header {
+        &self.header
+    }
+
+    /// Ticks read so far.
+    #[must_use]
+    pub fn ticks(&self) -> u64 {
+        self.ticks
+    }
+
+    /// Whether its proper end was read; a log without one was cut, or is still being written.
+    #[must_use]
+    pub fn finished(&self) -> bool {
+        self.finished
+    }
+
+    /// Bytes read so far, and size of the file.
+    #[must_use]
+    pub fn progress_bytes(&self) -> (u64, u64) {
+        (self.frames.offset, self.bytes)
+    }
+
+    /// The next entry; none at the end.
+    ///
+    /// # Errors
+    /// [`LogError::Io`] or [`LogError::Damaged`]; nothing comes after an error.
+    pub fn read(&mut self) -> Result<Option<Entry>, LogError> {
+        if self.over {
+            return Ok(None);
+        }
+        let offset = self.frames.offset;
+        let read = self.read_entry(offset);
+        self.over = !matches!(read, Ok(Some(_)));
+        read
+    }
+
+    fn read_entry(&mut self, offset: u64) -> Result<Option<Entry>, LogError> {
+        let (path, ticks) = (self.path.clone(), self.ticks);
+        let damaged = |reason: String| LogError::Damaged { path: path.clone(), offset, reason, ticks };
+        let next = self.frames.next().map_err(|source| LogError::Io { path: path.clone(), source })?;
+        let payload = match next {
+            Next::Payload(payload) => payload,
+            Next::End => return Ok(None),
+            Next::Damaged(reason) => return Err(damaged(reason)),
+        };
+        let record =
+            postcard::from_bytes(payload).map_err(|error| damaged(format!("not a record: {error}")))?;
+        match record {
+            Record::Tick(record) => {
+                let observation = self.observation(&record).map_err(damaged)?;
+                self.ticks += 1;
+                Ok(Some(Entry::Tick(Box::new(LoggedTick { index: ticks, record: *record, observation }))))
+            }
+            Record::Policy(identity) => Ok(Some(Entry::Policy(identity))),
+            Record::End { .. } => {
+                self.finished = true;
+                Ok(None)
+            }
+        }
+    }
+
+    fn observation(&mut self, record: &TickRecord) -> Result<Option<Observation>, String> {
+        let Some(observed) = &record.observed else { return Ok(None) };
+        let mut observation = observed.without_picture();
+        self.images.unpack(&observed.image, &mut observation.image)?;
+        if let Some(mask) = &observed.mask {
+            mask.unpack(&mut observation.robot_mask)?;
+        }
+        Ok(Some(observation))
+    }
+}
+
+/// The version, or what there is instead of a log.
+fn read_start(file: &mut impl Read) -> std::io::Result<Result<u32, String>> {
+    let mut start = [0; MAGIC.len() + 4];
+    let found = read_up_to(file, &mut start)?;
+    let (magic, version) = start.split_at(MAGIC.len());
+    if found < start.len() || magic != MAGIC {
+        return Ok(Err("it does not begin with the bytes \"rcwm-log\"".into()));
+    }
+    Ok(Ok(version.iter().rev().fold(0, |number, byte| number << 8 | u32::from(*byte))))
+}

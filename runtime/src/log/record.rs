@@ -1,0 +1,329 @@
+//! What a log holds.
+
+use rcwm_models::ACTION_LEN;
+use rcwm_models::PROPRIOCEPTION_LEN;
+use rcwm_models::bundle::Manifest;
+use rcwm_models::wire::{Action, Observation};
+use serde::{Deserialize, Serialize};
+use sha2::{Digest, Sha256};
+
+use super::pack::{PackedImage, PackedMask};
+use crate::controller::Fallback;
+use crate::engine::EngineSettings;
+use crate::policy::{BranchState, CallKind, Sampling, State, Surprise};
+
+/// Version of the file.
+pub(super) const VERSION: u32 = 1;
+/// One record of so many holds the whole state and a whole picture.
+pub const KEYFRAME_TICKS: u64 = 256;
+/// Bytes of a state's digest.
+pub(super) const DIGEST_BYTES: usize = 16;
+
+/// What the run was made with.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+pub struct Header {
+    /// Version of the program that wrote it.
+    pub program: String,
+    /// Seconds since 1970 at the start.
+    pub started_unix_s: u64,
+    /// The link's instance.
+    pub instance: String,
+    /// The bundle.
+    pub bundle: BundleIdentity,
+    /// The engine.
+    pub engine: EngineSettings,
+    /// How latents and actions were chosen, and the seed.
+    pub sampling: Sampling,
+    /// What was sent where the policy had nothing fit to send.
+    pub fallback: Fallback,
+    /// Largest change of an action's component from one action to the next.
+    pub rate_max: Option<f32>,
+    /// Names of the stages of a tick whose times each record holds, in order.
+    pub stages: Vec<String>,
+    /// The machine: other processors may round otherwise.
+    pub machine: Machine,
+}
+
+/// The machine a log was written on.
+#[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
+pub struct Machine {
+    /// As in `x86_64`.
+    pub architecture: String,
+    /// The processor's name, empty where the system does not say.
+    pub processor: String,
+}
+
+impl Machine {
+    /// This one.
+    #[must_use]
+    pub fn here() -> Self {
+        let text = std::fs::read_to_string("/proc/cpuinfo").unwrap_or_default();
+        let name = text.lines().find_map(|line| line.strip_prefix("model name")?.split_once(": "));
+        Self {
+            architecture: std::env::consts::ARCH.to_owned(),
+            processor: name.map(|(_, name)| name.trim().to_owned()).unwrap_or_default(),
+        }
+    }
+}
+
+/// Which bundle, by content.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+pub struct BundleIdentity {
+    /// Its task.
+    pub task: String,
+    /// Its preset.
+    pub preset: String,
+    /// sha256 of the initial state and of every part, by name.
+    pub sha256: Vec<(String, String)>,
+    /// Smallest and largest values of each action component.
+    pub action_limits: [[f32; ACTION_LEN]; 2],
+}
+
+impl BundleIdentity {
+    /// Of a manifest, whose checksums were checked when the bundle was loaded.
+    #[must_use]
+    pub fn of(manifest: &Manifest) -> Self {
+        let parts = manifest.parts.iter().map(|part| (part.name.to_string(), part.sha256.clone()));
+        let initial = ("initial".to_owned(), manifest.initial.sha256.clone());
+        Self {
+            task: manifest.task.clone(),
+            preset: manifest.provenance.preset.clone(),
+            sha256: std::iter::once(initial).chain(parts).collect(),
+            action_limits: [manifest.control.action_low, manifest.control.action_high],
+        }
+    }
+
+    /// What another bundle differs in, as far as it matters for a tick; none where it is the same.
+    #[must_use]
+    pub fn difference(&self, other: &Self) -> Option<String> {
+        let names = ["initial", "encoder", "robot", "interaction", "environment", "actor"];
+        let of = |bundle: &Self, name: &str| {
+            bundle.sha256.iter().find(|(part, _)| part == name).map(|(_, sha256)| sha256.clone())
+        };
+        let differing = names.into_iter().find(|name| of(self, name) != of(other, name));
+        let short = |sha256: Option<String>| {
+            sha256.map_or("missing".into(), |sha256| sha256[..12.min(sha256.len())].to_owned())
+        };
+        match differing {
+            Some(name) => {
+                let (logged, found) = (short(of(self, name)), short(of(other, name)));
+                Some(format!(
+                    "sha256 of {name} begins with {found}, logged was {logged} ({}, {})",
+                    self.task, self.preset
+                ))
+            }
+            None if self.action_limits != other.action_limits => Some("its action limits are others".into()),
+            None => None,
+        }
+    }
+}
+
+/// One entry after the header.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+pub enum Record {
+    /// A tick.
+    Tick(Box<TickRecord>),
+    /// From here on another policy ran, from its initial state.
+    Policy(BundleIdentity),
+    /// The log was finished properly.
+    End {
+        /// Ticks in it.
+        ticks: u64,
+        /// Ticks that were dropped.
+        dropped: u64,
+    },
+}
+
+/// One tick.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+pub struct TickRecord {
+    /// Ticks before it that were dropped because the writer could not keep up.
+    pub dropped_before: u64,
+    /// Calls before it are not in the log (dropped with their ticks): a replay takes `state` over and goes on from here.
+    pub resumes: bool,
+    /// The policy's state started anew.
+    pub is_first: bool,
+    /// What was observed; none where nothing came.
+    pub observed: Option<Observed>,
+    /// When the observation was due, in ns of the monotonic clock.
+    pub scheduled_ns: u64,
+    /// When it was received, or found overdue.
+    pub received_ns: u64,
+    /// The answer was not sent: a newer observation had come before it was ready.
+    pub overtaken: bool,
+    /// What the policy was asked since the last tick, and how it went.
+    pub calls: Vec<LoggedCall>,
+    /// What was sent.
+    pub answer: Answer,
+    /// Digest of the state after the calls.
+    pub digest: [u8; DIGEST_BYTES],
+    /// The whole state after them, in keyframes.
+    pub state: Option<WholeState>,
+}
+
+/// An observation but for its picture, which is packed.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+pub struct Observed {
+    /// See [`Observation::sequence`].
+    pub sequence: u64,
+    /// See [`Observation::episode`].
+    pub episode: u64,
+    /// See [`Observation::scheduled_ns`].
+    pub scheduled_ns: u64,
+    /// See [`Observation::published_ns`].
+    pub published_ns: u64,
+    /// See [`Observation::period_ns`].
+    pub period_ns: u64,
+    /// See [`Observation::step`].
+    pub step: u32,
+    /// See [`Observation::flags`].
+    pub flags: u32,
+    /// See [`Observation::task`].
+    pub task: u32,
+    /// See [`Observation::reward`].
+    pub reward: f32,
+    /// See [`Observation::executed_action`].
+    pub executed_action: [f32; ACTION_LEN],
+    /// See [`Observation::proprioception`].
+    pub proprioception: [f32; PROPRIOCEPTION_LEN],
+    /// See [`Observation::image`].
+    pub image: PackedImage,
+    /// See [`Observation::robot_mask`]; one bit a pixel, where there is one.
+    pub mask: Option<PackedMask>,
+}
+
+impl Observed {
+    pub(super) fn of(observation: &Observation, image: PackedImage, mask: Option<PackedMask>) -> Self {
+        let o = observation;
+        Self {
+            sequence: o.sequence,
+            episode: o.episode,
+            scheduled_ns: o.scheduled_ns,
+            published_ns: o.published_ns,
+            period_ns: o.period_ns,
+            step: o.step,
+            flags: o.flags,
+            task: o.task,
+            reward: o.reward,
+            executed_action: o.executed_action,
+            proprioception: o.proprioception,
+            image,
+            mask,
+        }
+    }
+
+    /// The observation but for picture and mask, which are zeros.
+    pub(super) fn without_picture(&self) -> Observation {
+        Observation {
+            sequence: self.sequence,
+            episode: self.episode,
+            scheduled_ns: self.scheduled_ns,
+            published_ns: self.published_ns,
+            period_ns: self.period_ns,
+            step: self.step,
+            flags: self.flags,
+            task: self.task,
+            reward: self.reward,
+            executed_action: self.executed_action,
+            proprioception: self.proprioception,
+            ..Observation::zeroed()
+        }
+    }
+}
+
+/// What was sent.
+#[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
+pub struct Answer {
+    /// See [`Action::answers`].
+    pub answers: u64,
+    /// See [`Action::published_ns`].
+    pub published_ns: u64,
+    /// See [`Action::source`].
+    pub source: u32,
+    /// See [`Action::action`].
+    pub action: [f32; ACTION_LEN],
+}
+
+impl From<Action> for Answer {
+    fn from(action: Action) -> Self {
+        let Action { answers, published_ns, source, action, .. } = action;
+        Self { answers, published_ns, source, action }
+    }
+}
+
+/// A call of the policy.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+pub struct LoggedCall {
+    /// What was asked.
+    pub kind: CallKind,
+    /// The action it was about; none at an episode's start.
+    pub action: Option<[f32; ACTION_LEN]>,
+    /// What the policy decided, or how it failed.
+    pub outcome: LoggedOutcome,
+}
+
+/// How a call ended.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+pub enum LoggedOutcome {
+    /// Work ahead was done, in so many ns.
+    Done(u64),
+    /// The policy went back to an earlier state, the one with this checksum.
+    StateSet(u32),
+    /// A decision was made.
+    Decided {
+        /// The action.
+        action: [f32; ACTION_LEN],
+        /// Work ahead was done again.
+        recomputed: bool,
+        /// How unexpected the picture was.
+        surprise: Option<Surprise>,
+        /// Time in each of [`Header::stages`], in ns.
+        stage_ns: Vec<u64>,
+    },
+    /// It failed, in these words.
+    Failed(String),
+}
+
+/// z and h of both branches, and where the random generator stands.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+pub struct WholeState {
+    robot_z: Vec<i64>,
+    robot_h: Vec<f32>,
+    environment_z: Vec<i64>,
+    environment_h: Vec<f32>,
+    noise_position: u128,
+}
+
+impl WholeState {
+    pub(super) fn of(state: &State, noise_position: u128) -> Self {
+        Self {
+            robot_z: state.robot.z.clone(),
+            robot_h: state.robot.h.clone(),
+            environment_z: state.environment.z.clone(),
+            environment_h: state.environment.h.clone(),
+            noise_position,
+        }
+    }
+
+    /// The policy's state, and where its random generator stands.
+    #[must_use]
+    pub fn restore(&self) -> (State, u128) {
+        let branch = |z: &[i64], h: &[f32]| BranchState { z: z.to_vec(), h: h.to_vec() };
+        let state = State {
+            robot: branch(&self.robot_z, &self.robot_h),
+            environment: branch(&self.environment_z, &self.environment_h),
+        };
+        (state, self.noise_position)
+    }
+}
+
+/// The first half of the sha256 over the bits of z and h of both branches.
+pub(super) fn digest(state: &State) -> [u8; DIGEST_BYTES] {
+    let mut hash = Sha256::new();
+    for branch in [&state.robot, &state.environment] {
+        branch.z.iter().for_each(|class| hash.update(class.to_le_bytes()));
+        branch.h.iter().for_each(|value| hash.update(value.to_le_bytes()));
+    }
+    let whole = hash.finalize();
+    std::array::from_fn(|index| whole[index])
+}

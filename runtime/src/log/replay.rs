@@ -1,0 +1,447 @@
+//! The same calls once more.
+
+use std::collections::VecDeque;
+use std::path::{Path, PathBuf};
+use std::time::Instant;
+
+use rcwm_models::ACTION_LEN;
+use rcwm_models::bundle::Bundle;
+use rcwm_models::wire::ActionSource;
+use serde::Serialize;
+
+use super::LogError;
+use super::reader::{Entry, LogReader, LoggedTick};
+use super::record::{BundleIdentity, Header, LoggedCall, LoggedOutcome, TickRecord, WholeState, digest};
+use crate::controller::Gate;
+use crate::engine::EngineSettings;
+use crate::policy::{CallKind, CallOutcome, Policy, State};
+use crate::telemetry::{Latency, Stage, Telemetry, table};
+
+/// Where a replay differs from the log.
+#[derive(Debug, Clone, PartialEq, Serialize)]
+pub struct Difference {
+    /// The tick, counted from 0 in the log.
+    pub tick: u64,
+    /// Sequence of the observation that was answered.
+    pub sequence: u64,
+    /// What differs.
+    pub what: String,
+    /// What the log holds.
+    pub logged: String,
+    /// What the replay gave.
+    pub replayed: String,
+}
+
+/// A replay, as printed and as written with `--json`.
+#[derive(Debug, Clone, PartialEq, Serialize)]
+pub struct ReplayReport {
+    /// The engine it was replayed on.
+    pub engine: EngineSettings,
+    /// What the run was made with.
+    pub log: Header,
+    /// The log has its proper end.
+    pub log_finished: bool,
+    /// Where the log is damaged; all before it was replayed.
+    pub log_damage: Option<String>,
+    /// Ticks replayed.
+    pub ticks: u64,
+    /// Ticks whose calls are in the log and were made again; the others follow on dropped ones.
+    pub ticks_compared: u64,
+    /// Ticks that the log says were dropped.
+    pub ticks_dropped: u64,
+    /// Answers of the policy on an observation, on an imagined state, and of the fallback.
+    pub answers: [u64; 3],
+    /// Calls made again.
+    pub calls: u64,
+    /// Work ahead that was done again because another action was executed.
+    pub recomputed: u64,
+    /// Calls on which the policy failed, as logged.
+    pub failures: u64,
+    /// Policies that took over while it ran.
+    pub swaps: u64,
+    /// Ticks that differ in anything.
+    pub ticks_differing: u64,
+    /// Largest difference of an action's component.
+    pub action_error_max: f32,
+    /// The first difference; none when all is the same bit for bit.
+    pub first_difference: Option<Difference>,
+    /// Times of the replay.
+    pub latency: Vec<Latency>,
+}
+
+/// Makes the calls of a log again.
+pub struct Replayer {
+    engine: EngineSettings,
+    bundles: Vec<(PathBuf, BundleIdentity, Bundle)>,
+    policy: Policy,
+    telemetry: Telemetry,
+    report: ReplayReport,
+    resumed: bool,
+    gate: Gate,
+    /// What the gate let through last is in the log.
+    last_sent_known: bool,
+    /// What the policy decided last in this tick.
+    decided: Option<[f32; ACTION_LEN]>,
+    /// The last states, by their checksums: the controller may go back to one of them.
+    states: VecDeque<(u32, State)>,
+}
+
+/// States that are remembered: more than are imagined in a row.
+const STATES_MAX: usize = 1024;
+
+impl Replayer {
+    /// Loads the bundle that the log was made with; `bundles` are the folders it is looked for in, and those that took over.
+    /// Without `engine` the log's own is used.
+    ///
+    /// # Errors
+    /// [`LogError::OtherBundle`], [`LogError::Bundle`] or [`LogError::Policy`].
+    pub fn new(
+        header: &Header,
+        bundles: &[PathBuf],
+        engine: Option<EngineSettings>,
+    ) -> Result<Self, LogError> {
+        let engine = engine.unwrap_or(header.engine);
+        let open = |folder: &PathBuf| -> Result<_, LogError> {
+            let bundle = Bundle::open(folder)?;
+            Ok((folder.clone(), BundleIdentity::of(&bundle.manifest), bundle))
+        };
+        let bundles = bundles.iter().map(open).collect::<Result<Vec<_>, _>>()?;
+        let policy = load(&bundles, &header.bundle, header, engine)?;
+        let report = ReplayReport::new(header.clone(), engine);
+        let states = VecDeque::with_capacity(STATES_MAX);
+        Ok(Self {
+            engine,
+            bundles,
+            gate: Gate::new(policy.limits(), header.rate_max),
+            policy,
+            telemetry: Telemetry::new(),
+            report,
+            resumed: false,
+            last_sent_known: true,
+            decided: None,
+            states,
+        })
+    }
+
+    /// Replays the whole log; `go_on` is asked after every entry with the bytes read and in all.
+    ///
+    /// # Errors
+    /// As [`Self::new`], or [`LogError::Io`]. A difference is no error, and neither is damage: they are in the report.
+    pub fn run(
+        &mut self,
+        log: &mut LogReader,
+        go_on: &mut dyn FnMut((u64, u64)) -> bool,
+    ) -> Result<ReplayReport, LogError> {
+        loop {
+            match log.read() {
+                Ok(Some(Entry::Tick(tick))) => self.tick(&tick),
+                Ok(Some(Entry::Policy(identity))) => self.exchange(&identity)?,
+                Ok(None) => break,
+                Err(error @ LogError::Damaged { .. }) => {
+                    self.report.log_damage = Some(error.to_string());
+                    break;
+                }
+                Err(error) => return Err(error),
+            }
+            if !go_on(log.progress_bytes()) {
+                break;
+            }
+        }
+        self.report.log_finished = log.finished();
+        self.report.latency = self.telemetry.latencies();
+        Ok(self.report.clone())
+    }
+
+    /// What was measured.
+    #[must_use]
+    pub fn telemetry(&self) -> &Telemetry {
+        &self.telemetry
+    }
+
+    fn exchange(&mut self, identity: &BundleIdentity) -> Result<(), LogError> {
+        self.policy = load(&self.bundles, identity, &self.report.log, self.engine)?;
+        self.states.clear();
+        let last = self.gate.last();
+        self.gate = Gate::new(self.policy.limits(), self.report.log.rate_max);
+        last.into_iter().for_each(|last| self.gate.sent(last));
+        self.report.swaps += 1;
+        Ok(())
+    }
+
+    fn tick(&mut self, tick: &LoggedTick) {
+        let record = &tick.record;
+        self.report.ticks += 1;
+        self.report.ticks_dropped += record.dropped_before;
+        if let Some(count) = self.report.answers.get_mut(record.answer.source as usize) {
+            *count += 1;
+        }
+        if record.resumes {
+            self.resume(tick);
+            return;
+        }
+        self.report.ticks_compared += 1;
+        let difference = self.calls(tick);
+        let answer = self.answer(record);
+        let difference = difference.or_else(|| self.state(record)).or(answer);
+        self.resumed = false;
+        self.differs(tick, difference);
+    }
+
+    fn differs(&mut self, tick: &LoggedTick, difference: Option<[String; 3]>) {
+        let Some([what, logged, replayed]) = difference else { return };
+        self.report.ticks_differing += 1;
+        let sequence = tick.record.answer.answers;
+        let difference = Difference { tick: tick.index, sequence, what, logged, replayed };
+        self.report.first_difference.get_or_insert(difference);
+    }
+
+    /// After dropped ticks the logged state is taken over.
+    fn resume(&mut self, tick: &LoggedTick) {
+        let restored = tick.record.state.as_ref().map(WholeState::restore);
+        let taken = restored.is_some_and(|(state, noise_position)| {
+            self.policy.set_noise_position(noise_position);
+            self.policy.set_state(&state).is_ok()
+        });
+        (self.resumed, self.last_sent_known) = (true, false);
+        self.states.clear();
+        self.sent(&tick.record);
+        if !taken {
+            let what = "the state after dropped ticks".to_owned();
+            self.differs(tick, Some([what, "missing, or of another size".into(), "the model's size".into()]));
+        }
+    }
+
+    /// Makes the calls of a tick and gives the first difference.
+    fn calls(&mut self, tick: &LoggedTick) -> Option<[String; 3]> {
+        let mut first = None;
+        self.decided = None;
+        let start = Instant::now();
+        let mut answered = false;
+        for call in &tick.record.calls {
+            let Some(replayed) = self.call(call, tick) else {
+                let what = "what the policy was asked".to_owned();
+                return Some([
+                    what,
+                    format!("{:?}", call.kind),
+                    "the log does not hold what that needs".into(),
+                ]);
+            };
+            answered |= matches!(call.kind, CallKind::Observe | CallKind::Imagine);
+            if let LoggedOutcome::Decided { action, .. } = &replayed {
+                self.decided = Some(*action);
+            }
+            let difference = self.compare(&call.outcome, &replayed);
+            first = first.or(difference);
+        }
+        if answered {
+            self.telemetry.record(Stage::Tick, start.elapsed().as_nanos() as u64);
+        }
+        first
+    }
+
+    /// Makes one call; none where the log does not hold what it needs.
+    fn call(&mut self, call: &LoggedCall, tick: &LoggedTick) -> Option<LoggedOutcome> {
+        let action = call.action.as_ref();
+        self.remember();
+        let made = self.policy.calls_made();
+        match (call.kind, action, &tick.observation) {
+            (CallKind::WorkAhead, ..) => drop(self.policy.work_ahead(action)),
+            (CallKind::Imagine, Some(action), _) => drop(self.policy.imagine(action)),
+            (CallKind::Observe, _, Some(observation)) => {
+                drop(self.policy.observe(&observation.image, action))
+            }
+            (CallKind::SetState, ..) => self.go_back(&call.outcome)?,
+            (CallKind::Imagine, None, _) | (CallKind::Observe, _, None) => return None,
+        }
+        let outcome = self.policy.calls_since(made).next()?.outcome;
+        self.report.calls += 1;
+        match &outcome {
+            CallOutcome::Decided { recomputed, stage_ns, .. } => {
+                self.report.recomputed += u64::from(*recomputed);
+                for (stage, time_ns) in Stage::POLICY.into_iter().zip(stage_ns) {
+                    self.telemetry.record(stage, *time_ns);
+                }
+            }
+            CallOutcome::Done { time_ns } => self.telemetry.record(Stage::Ahead, *time_ns),
+            _ => {}
+        }
+        Some(outcome.into())
+    }
+
+    fn remember(&mut self) {
+        let state = self.policy.state();
+        let checksum = state.checksum();
+        if self.states.back().is_some_and(|(last, _)| *last == checksum) {
+            return;
+        }
+        // The oldest makes room, and its memory is used again.
+        let mut place = match self.states.len() {
+            STATES_MAX => self.states.pop_front().unwrap_or_default(),
+            _ => Default::default(),
+        };
+        place.0 = checksum;
+        place.1.clone_from(state);
+        self.states.push_back(place);
+    }
+
+    /// Goes back to the state that the log names; none where it is not known.
+    fn go_back(&mut self, outcome: &LoggedOutcome) -> Option<()> {
+        let LoggedOutcome::StateSet(wanted) = outcome else { return None };
+        let (_, state) = self.states.iter().rev().find(|(checksum, _)| checksum == wanted)?;
+        self.policy.set_state(state).ok()
+    }
+
+    fn compare(&mut self, logged: &LoggedOutcome, replayed: &LoggedOutcome) -> Option<[String; 3]> {
+        use LoggedOutcome::{Decided, Done, Failed};
+        let (
+            Decided { action, recomputed, surprise, .. },
+            Decided { action: a, recomputed: r, surprise: s, .. },
+        ) = (logged, replayed)
+        else {
+            self.report.failures += u64::from(matches!(logged, Failed(_)));
+            let ahead = matches!((logged, replayed), (Done(_), Done(_)));
+            return (!ahead && logged != replayed)
+                .then(|| ["the policy's outcome".into(), said(logged), said(replayed)]);
+        };
+        for (logged, replayed) in action.iter().zip(a) {
+            self.report.action_error_max = self.report.action_error_max.max((logged - replayed).abs());
+        }
+        let bits = |values: &[f32]| values.iter().map(|value| value.to_bits()).collect::<Vec<_>>();
+        let surprise_bits =
+            |surprise: &Option<crate::policy::Surprise>| surprise.map(|s| bits(&[s.robot, s.environment]));
+        if bits(action) != bits(a) {
+            return Some(["the action".into(), format!("{action:?}"), format!("{a:?}")]);
+        }
+        if surprise_bits(surprise) != surprise_bits(s) {
+            return Some(["the surprise".into(), format!("{surprise:?}"), format!("{s:?}")]);
+        }
+        // What was worked ahead before dropped ticks is not known.
+        (recomputed != r && !self.resumed)
+            .then(|| ["whether work ahead was done again".into(), recomputed.to_string(), r.to_string()])
+    }
+
+    /// What was sent: the policy's action, or the fallback, through the gate.
+    fn answer(&mut self, record: &TickRecord) -> Option<[String; 3]> {
+        let (header, logged) = (&self.report.log, record.answer.action);
+        if record.is_first {
+            self.gate.start_episode();
+            self.last_sent_known = true;
+        }
+        let of_policy = [ActionSource::Policy as u32, ActionSource::Imagined as u32];
+        let action = if of_policy.contains(&record.answer.source) {
+            self.decided
+        } else {
+            Some(header.fallback.action(self.gate.last()))
+        };
+        // An answer that was overtaken has not passed the gate: it was not sent.
+        let replayed =
+            if record.overtaken { action } else { action.map(|action| self.gate.pass(action).action) };
+        let known = self.last_sent_known;
+        self.sent(record);
+        let same = replayed.is_some_and(|replayed| replayed.map(f32::to_bits) == logged.map(f32::to_bits));
+        (known && !same).then(|| ["the action sent".into(), format!("{logged:?}"), format!("{replayed:?}")])
+    }
+
+    fn sent(&mut self, record: &TickRecord) {
+        if !record.overtaken {
+            self.gate.sent(record.answer.action);
+            self.last_sent_known = true;
+        }
+    }
+
+    fn state(&self, record: &TickRecord) -> Option<[String; 3]> {
+        let replayed = digest(self.policy.state());
+        let hex = |bytes: [u8; 16]| format!("{:032x}", u128::from_be_bytes(bytes));
+        (replayed != record.digest).then(|| ["the state's digest".into(), hex(record.digest), hex(replayed)])
+    }
+}
+
+fn said(outcome: &LoggedOutcome) -> String {
+    match outcome {
+        LoggedOutcome::Done(_) => "work ahead was done".into(),
+        LoggedOutcome::StateSet(checksum) => format!("went back to the state {checksum:08x}"),
+        LoggedOutcome::Decided { action, .. } => format!("decided {action:?}"),
+        LoggedOutcome::Failed(reason) => reason.clone(),
+    }
+}
+
+fn load(
+    bundles: &[(PathBuf, BundleIdentity, Bundle)],
+    wanted: &BundleIdentity,
+    header: &Header,
+    engine: EngineSettings,
+) -> Result<Policy, LogError> {
+    let fitting = bundles.iter().find(|(_, identity, _)| wanted.difference(identity).is_none());
+    let Some((_, _, bundle)) = fitting else {
+        let tried: Vec<_> = bundles.iter().map(|(folder, ..)| Path::display(folder).to_string()).collect();
+        let difference = bundles.iter().find_map(|(_, identity, _)| wanted.difference(identity));
+        let difference = difference.unwrap_or_else(|| "no bundle was named".into());
+        return Err(LogError::OtherBundle { tried: tried.join(", "), difference });
+    };
+    Ok(Policy::new(bundle, engine, header.sampling)?)
+}
+
+impl ReplayReport {
+    fn new(log: Header, engine: EngineSettings) -> Self {
+        Self {
+            engine,
+            log,
+            log_finished: false,
+            log_damage: None,
+            ticks: 0,
+            ticks_compared: 0,
+            ticks_dropped: 0,
+            answers: [0; 3],
+            calls: 0,
+            recomputed: 0,
+            failures: 0,
+            swaps: 0,
+            ticks_differing: 0,
+            action_error_max: 0.0,
+            first_difference: None,
+            latency: Vec::new(),
+        }
+    }
+
+    /// The report for people.
+    #[must_use]
+    pub fn text(&self) -> String {
+        let Self {
+            ticks, ticks_compared, ticks_dropped, answers, calls, recomputed, failures, swaps, ..
+        } = self;
+        let [observed, imagined, fallback] = answers;
+        let mut text = format!(
+            "replay     {} bundle for {}, engine {}, logged on {} {}\n",
+            self.log.bundle.preset,
+            self.log.bundle.task,
+            self.engine.kind,
+            self.log.machine.architecture,
+            self.log.machine.processor
+        );
+        text += &format!(
+            "ticks      {ticks}, compared {ticks_compared}, dropped in the log {ticks_dropped}; answers: policy {observed}, imagined \
+             {imagined}, fallback {fallback}\n"
+        );
+        text += &format!(
+            "calls      {calls}, recomputed {recomputed}, failed as logged {failures}, swaps {swaps}\n"
+        );
+        if !self.log_finished && self.log_damage.is_none() {
+            text += "log        has no end: it was cut, or is still being written\n";
+        }
+        text += &match self.ticks_differing {
+            0 => format!("result     all {ticks_compared} ticks are the same, bit for bit\n"),
+            count => format!(
+                "result     {count} of {ticks_compared} ticks differ; largest difference of an action {:.3e}\n",
+                self.action_error_max
+            ),
+        };
+        text + &table(&self.latency)
+    }
+}
+
+impl std::fmt::Display for Difference {
+    fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
+        let Self { tick, sequence, what, logged, replayed } = self;
+        write!(f, "tick {tick} (observation {sequence}): {what}: logged {logged}, replayed {replayed}")
+    }
+}

@@ -1,0 +1,49 @@
+//! Latencies as files, at the end of a run.
+
+use std::path::PathBuf;
+
+use clap::Args;
+
+use super::{Curve, PlotError, Stage, Telemetry, plot};
+
+/// The options of every verb that measures latencies.
+#[derive(Debug, Clone, Default, Args)]
+pub struct LatencyFiles {
+    /// Writes the latencies of every stage into this folder, as HdrHistogram percentile files in microseconds
+    #[arg(long, value_name = "DIR")]
+    pub hgrm: Option<PathBuf>,
+    /// Draws latency by percentile, a line a stage, into this PNG file
+    #[arg(long, value_name = "FILE")]
+    pub plot: Option<PathBuf>,
+}
+
+impl LatencyFiles {
+    /// Writes what was asked for; `period_us` is a line in the plot.
+    ///
+    /// # Errors
+    /// See [`PlotError`].
+    pub fn write(&self, telemetry: &Telemetry, title: &str, period_us: Option<f64>) -> Result<(), PlotError> {
+        if let Some(folder) = &self.hgrm {
+            telemetry.write_hgrm(folder)?;
+        }
+        if let Some(file) = &self.plot {
+            let curves: Vec<_> = Stage::ALL
+                .into_iter()
+                .filter(|stage| !telemetry.histogram(*stage).is_empty())
+                .map(|stage| Curve {
+                    label: stage.as_str().replace('_', " "),
+                    histogram: telemetry.histogram(stage),
+                })
+                .collect();
+            plot(file, title, &curves, period_us)?;
+        }
+        Ok(())
+    }
+
+    /// One line for people of each thing that was written.
+    #[must_use]
+    pub fn lines(&self) -> String {
+        let written = [&self.hgrm, &self.plot].into_iter().flatten();
+        written.map(|path| format!("latencies  {}\n", path.display())).collect()
+    }
+}
