@@ -20,7 +20,7 @@ use rcwm_models::tensors::TensorsError;
 use crate::compile::{CompileError, Optimizations, compile};
 use crate::inspect::{Cost, CostError, InspectError, inspect};
 use crate::policy::{Policy, PolicyError, Sampling};
-use crate::telemetry::{Stage, Telemetry};
+use crate::telemetry::{Curve, LatencyFiles, PlotError, Stage, Telemetry, plot};
 
 /// Why nothing could be measured.
 #[derive(Debug, thiserror::Error)]
@@ -61,7 +61,7 @@ pub fn bench(
     cases: &[Case],
     ticks: usize,
     go_on: &mut dyn FnMut() -> bool,
-) -> Result<BenchReport, BenchError> {
+) -> Result<Measured, BenchError> {
     let machine = measure_machine(inspect(bundle)?.tick.weight_bytes)?;
     let limit = machine.of(&late_cost(bundle)?);
     let mut runners = cases
@@ -89,9 +89,46 @@ pub fn bench(
             break;
         }
     }
-    let runs: Vec<(Case, &Telemetry)> =
-        runners.iter().map(|runner| (runner.case, &runner.telemetry)).collect();
-    Ok(BenchReport::new(bundle, measured, limit, &runs))
+    let runs: Vec<(Case, Telemetry)> =
+        runners.into_iter().map(|runner| (runner.case, runner.telemetry)).collect();
+    Ok(Measured { report: BenchReport::new(bundle, measured, limit, &runs), runs })
+}
+
+/// What was measured: the report, and every time behind it.
+pub struct Measured {
+    /// Sums and ratios.
+    pub report: BenchReport,
+    /// Histograms of each case.
+    pub runs: Vec<(Case, Telemetry)>,
+}
+
+impl Measured {
+    /// Writes what was asked for: a folder of percentile files a case, and the cases' ticks as lines of one plot.
+    ///
+    /// # Errors
+    /// See [`PlotError`].
+    pub fn write(&self, files: &LatencyFiles) -> Result<(), PlotError> {
+        if let Some(folder) = &files.hgrm {
+            for (case, telemetry) in &self.runs {
+                let plain: String = case.name.chars().filter(|c| c.is_alphanumeric() || *c == ' ').collect();
+                telemetry.write_hgrm(&folder.join(plain.trim().replace(' ', "-")))?;
+            }
+        }
+        if let Some(file) = &files.plot {
+            let curves: Vec<Curve<'_>> = self
+                .runs
+                .iter()
+                .map(|(case, telemetry)| Curve {
+                    label: case.name.to_owned(),
+                    histogram: telemetry.histogram(Stage::Tick),
+                })
+                .collect();
+            let title =
+                format!("image to action, {} bundle, {} ticks each", self.report.preset, self.report.ticks);
+            plot(file, &title, &curves, None)?;
+        }
+        Ok(())
+    }
 }
 
 /// Cost of what stands between image and action, by the exported files' own operators.

@@ -56,7 +56,7 @@ pub struct BenchReport {
 }
 
 impl BenchReport {
-    pub(super) fn new(bundle: &Bundle, ticks: usize, limit: Limit, runs: &[(Case, &Telemetry)]) -> Self {
+    pub(super) fn new(bundle: &Bundle, ticks: usize, limit: Limit, runs: &[(Case, Telemetry)]) -> Self {
         let engines: Vec<CaseBench> = runs
             .iter()
             .map(|(case, telemetry)| CaseBench {

@@ -6,6 +6,7 @@ use std::sync::atomic::Ordering;
 use clap::Args;
 
 use super::EngineChoice;
+use crate::telemetry::LatencyFiles;
 
 /// Arguments of `bench`.
 #[derive(Debug, Args)]
@@ -25,6 +26,8 @@ pub(super) struct BenchArguments {
     /// Measures tract from the exported parts to what is deployed, one optimisation at a time, in place of the engines
     #[arg(long)]
     ladder: bool,
+    #[command(flatten)]
+    files: LatencyFiles,
     /// Writes everything to this file as JSON
     #[arg(long, value_name = "FILE")]
     json: Option<PathBuf>,
@@ -41,7 +44,7 @@ pub(super) fn run(arguments: &BenchArguments) -> anyhow::Result<()> {
     let ticks = arguments.ticks as usize;
     let bar = super::progress_bar(ticks + ticks / 10, "measuring");
     let mut rounds: u64 = 0;
-    let report = crate::bench::bench(&bundle, &cases, ticks, &mut || {
+    let measured = crate::bench::bench(&bundle, &cases, ticks, &mut || {
         rounds += 1;
         // Drawing costs time that would disturb the next tick.
         if rounds.is_multiple_of(50) {
@@ -50,9 +53,12 @@ pub(super) fn run(arguments: &BenchArguments) -> anyhow::Result<()> {
         !stop.load(Ordering::Relaxed)
     })?;
     bar.finish_and_clear();
+    let report = &measured.report;
     print!("{}", if arguments.ladder { report.steps_text() } else { report.text() });
     if let Some(reason) = left_out {
         println!("engine ort not measured: {reason}");
     }
-    super::write_json(arguments.json.as_ref(), &report)
+    measured.write(&arguments.files)?;
+    print!("{}", arguments.files.lines());
+    super::write_json(arguments.json.as_ref(), report)
 }
