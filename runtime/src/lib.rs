@@ -6,6 +6,7 @@
 //! | [`policy`] | one tick: image and executed action in, action distribution out; carries z and h of both branches |
 //! | [`controller`] | the loop over shared memory: order of observations, fallback, action limits, counters |
 //! | [`telemetry`] | latency histograms, one per stage |
+//! | [`swap`] | another policy in place of the running one |
 //! | [`record`] | films, strips and episodes of what the policy saw, written beside the loop |
 //! | [`verify`] | a bundle against its golden values |
 //! | [`inspect`] | what a bundle holds and what a tick costs |
@@ -36,6 +37,7 @@ pub mod engine;
 pub mod inspect;
 pub mod policy;
 pub mod record;
+pub mod swap;
 pub mod telemetry;
 pub mod verify;
 

@@ -12,6 +12,7 @@ mod bench;
 mod inspect;
 mod run;
 mod status;
+mod swap;
 mod verify;
 
 use std::path::{Path, PathBuf};
@@ -44,6 +45,7 @@ Examples:
   rcwm-runtime inspect --bundle models/bundles/debug
   rcwm-runtime verify --bundle models/bundles/debug
   rcwm-runtime run --bundle models/bundles/debug --instance demo --record runs/demo --json runs/demo.json
+  rcwm-runtime swap --instance demo --bundle models/bundles/debug --now
   rcwm-runtime bench --bundle models/bundles/debug --engine all --ticks 2000
 
 Exit codes:
@@ -57,6 +59,8 @@ Environment:
 enum Verb {
     /// Answers a simulator's (or a robot's) observations over shared memory
     Run(run::RunArguments),
+    /// Has a run take over another bundle, without a missed tick
+    Swap(swap::SwapArguments),
     /// Checks a bundle against its golden values: every part and the whole tick
     Verify(verify::VerifyArguments),
     /// Shows parts, shapes, sizes, operators, and what a tick costs
@@ -98,6 +102,7 @@ impl EngineChoice {
 pub fn main() -> ExitCode {
     let result = match Arguments::parse().verb {
         Verb::Run(arguments) => run::run(&arguments),
+        Verb::Swap(arguments) => swap::run(&arguments),
         Verb::Verify(arguments) => verify::run(&arguments),
         Verb::Inspect(arguments) => inspect::run(&arguments),
         Verb::Bench(arguments) => bench::run(&arguments),

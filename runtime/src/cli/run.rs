@@ -14,6 +14,7 @@ use crate::controller::{Controller, ControllerSettings, Ended, Fallback, TickObs
 use crate::engine::{EngineKind, EngineSettings};
 use crate::policy::{Policy, Sampling};
 use crate::record::{Recorded, Recorder};
+use crate::swap::{SwapSettings, Swapper};
 
 /// Arguments of `run`.
 #[derive(Debug, Args)]
@@ -67,7 +68,7 @@ pub(super) struct RunArguments {
     json: Option<PathBuf>,
 }
 
-fn seconds(text: &str) -> Result<f64, String> {
+pub(super) fn seconds(text: &str) -> Result<f64, String> {
     match text.parse::<f64>() {
         Ok(value) if (0.0..=1e6).contains(&value) => Ok(value),
         _ => Err("expected seconds, 0 to 1000000".into()),
@@ -85,6 +86,11 @@ pub(super) fn run(arguments: &RunArguments) -> anyhow::Result<()> {
     let policy = Policy::new(&bundle, engine, sampling)?;
     let mut recorder = start_recorder(arguments, &bundle, engine)?;
     let mut controller = Controller::open(policy, arguments.controller_settings())?;
+    // A recorder draws with the decoder of the bundle it was started with.
+    if arguments.record.is_none() {
+        let (link, rate_hz) = (LinkSettings::new(&arguments.instance), bundle.manifest.control.rate_hz);
+        controller.take_swaps(Swapper::start(SwapSettings { link, engine, sampling, rate_hz })?);
+    }
     let result = control(&mut controller, arguments, recorder.as_mut(), &stop);
     let mut report = controller.report(arguments.engine, *result.as_ref().unwrap_or(&Ended::Failed));
     // The simulator is told before anything slow is done.

@@ -24,6 +24,7 @@ use rcwm_models::wire::{
 };
 
 use crate::policy::{Decision, Policy, PolicyError};
+use crate::swap::{Moment, Swapper};
 use crate::telemetry::{Stage, Telemetry};
 
 /// Longest wait before signals are looked at.
@@ -128,6 +129,9 @@ pub struct Controller {
     whole_episodes: u64,
     pace: Option<Pace>,
     answer: Option<Action>,
+    swapper: Option<Swapper>,
+    /// The policy was exchanged: the next observation is the first of an episode to it.
+    fresh_policy: bool,
 }
 
 impl Controller {
@@ -149,7 +153,23 @@ impl Controller {
             whole_episodes: 0,
             pace: None,
             answer: None,
+            swapper: None,
+            fresh_policy: false,
         })
+    }
+
+    /// Takes over policies that are ready at a swap desk.
+    pub fn take_swaps(&mut self, swapper: Swapper) {
+        self.swapper = Some(swapper);
+    }
+
+    fn swap(&mut self, moment: Moment) {
+        if let Some(swapper) = &self.swapper
+            && swapper.poll(moment, &mut self.policy)
+        {
+            self.fresh_policy = true;
+            self.counters.swaps += 1;
+        }
     }
 
     /// Answers observations until the simulator closes, enough episodes are done, or `stop` is set.
@@ -186,7 +206,8 @@ impl Controller {
     }
 
     /// Nothing came for a while. Gives the time from which on the next silence counts.
-    fn idle(&self, start: Instant, quiet_since: Instant) -> Result<Instant, ControllerError> {
+    fn idle(&mut self, start: Instant, quiet_since: Instant) -> Result<Instant, ControllerError> {
+        self.swap(if self.running.is_some() { Moment::InEpisode } else { Moment::BetweenEpisodes });
         if self.counters.observations == 0
             && let Some(timeout) = self.settings.first_timeout
             && start.elapsed() >= timeout
@@ -241,6 +262,8 @@ impl Controller {
     ) -> Result<(), ControllerError> {
         if is_first {
             self.answer = None;
+            // Here only where the last episode was cut: else it happened in the idle time after its end.
+            self.swap(Moment::BetweenEpisodes);
         }
         let (source, action) = match self.decide(observation, is_first) {
             Some(decision) => (ActionSource::Policy, decision.action),
@@ -250,6 +273,10 @@ impl Controller {
         self.count_episode(observation, is_first);
         self.show(observation, is_first, answer, observers);
         self.finish_episode(observation);
+        self.swap(match observation.is(ObservationFlags::LAST) {
+            true => Moment::BetweenEpisodes,
+            false => Moment::InEpisode,
+        });
         Ok(())
     }
 
@@ -259,6 +286,8 @@ impl Controller {
             self.counters.refused_observations += 1;
             return None;
         }
+        let fresh_policy = std::mem::take(&mut self.fresh_policy);
+        let is_first = is_first || fresh_policy;
         match self.policy.observe(&observation.image, (!is_first).then_some(&observation.executed_action)) {
             Ok(decision) => {
                 for (stage, time_ns) in Stage::POLICY.into_iter().zip(decision.stage_ns) {

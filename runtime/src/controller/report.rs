@@ -37,6 +37,8 @@ pub struct Counters {
     pub missed_deadlines_published_late: u64,
     /// Another simulator took over the instance.
     pub peer_restarts: u64,
+    /// Policies taken over while running.
+    pub swaps: u64,
 }
 
 impl Counters {
@@ -241,6 +243,9 @@ impl RunReport {
             "safety     fallback answers {}, non-finite outputs {}, refused observations {}, engine errors {}\n",
             c.fallback_answers, c.non_finite_outputs, c.refused_observations, c.engine_errors
         );
+        if c.swaps > 0 {
+            text += &format!("swaps      {} policies taken over while running\n", c.swaps);
+        }
         if self.frames_dropped > 0 {
             text += &format!("recording  {} frames dropped\n", self.frames_dropped);
         }
