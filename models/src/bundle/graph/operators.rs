@@ -206,8 +206,17 @@ fn small<const N: usize>(found: &[i64], min: usize, max: usize) -> Result<[usize
         .ok_or_else(|| format!("numbers {found:?}, expected {N} from {min} to {max}"))
 }
 
-/// `[N, C, H, W]` and a constant kernel `[A, B, h, w]`, with a constant bias where there is one.
-fn picture<'a>(inputs: &[&'a Value]) -> Result<([usize; 4], [usize; 4], Option<&'a [usize]>), String> {
+/// Shapes that enter a convolution.
+struct Picture<'a> {
+    /// `[N, C, H, W]`.
+    x: [usize; 4],
+    /// `[A, B, h, w]`: channels out of and into a convolution, the other way round in a transposed one.
+    kernel: [usize; 4],
+    bias: Option<&'a [usize]>,
+}
+
+/// Kernel and bias are constants.
+fn picture<'a>(inputs: &[&'a Value]) -> Result<Picture<'a>, String> {
     let (x, kernel, bias) = match inputs.len() {
         2 => {
             let [x, kernel] = floats(inputs)?;
@@ -225,7 +234,7 @@ fn picture<'a>(inputs: &[&'a Value]) -> Result<([usize; 4], [usize; 4], Option<&
         <[usize; 4]>::try_from(value.shape.as_slice())
             .map_err(|_| format!("shape {:?}, expected 4 dimensions", value.shape))
     };
-    Ok((four(x)?, four(kernel)?, bias.map(|bias| bias.shape.as_slice())))
+    Ok(Picture { x: four(x)?, kernel: four(kernel)?, bias: bias.map(|bias| bias.shape.as_slice()) })
 }
 
 fn check_channels(found: usize, expected: usize, bias: Option<&[usize]>, to: usize) -> Result<(), String> {
@@ -247,7 +256,7 @@ fn check_unfolded(factors: [usize; 5]) -> Result<(), String> {
 }
 
 fn conv(attributes: &mut Attributes<'_>, inputs: &[&Value]) -> Inferred {
-    let ([n, c, height, width], [to, from, h, w], bias) = picture(inputs)?;
+    let Picture { x: [n, c, height, width], kernel: [to, from, h, w], bias } = picture(inputs)?;
     check_channels(c, from, bias, to)?;
     let window = Window::read(attributes, [h, w])?;
     let side = |i: usize, len: usize| -> Result<usize, String> {
@@ -261,7 +270,7 @@ fn conv(attributes: &mut Attributes<'_>, inputs: &[&Value]) -> Inferred {
 }
 
 fn conv_transpose(attributes: &mut Attributes<'_>, inputs: &[&Value]) -> Inferred {
-    let ([n, c, height, width], [from, to, h, w], bias) = picture(inputs)?;
+    let Picture { x: [n, c, height, width], kernel: [from, to, h, w], bias } = picture(inputs)?;
     check_channels(c, from, bias, to)?;
     let window = Window::read(attributes, [h, w])?;
     attributes.only("output_padding", &[0, 0])?;

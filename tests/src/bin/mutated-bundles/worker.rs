@@ -118,7 +118,7 @@ fn use_as_the_runtime_does(folder: &Path) -> (&'static str, String) {
 
 /// Some ticks; whether every action was fit to send.
 fn ticks(policy: &mut Policy) -> Result<bool, rcwm_runtime::PolicyError> {
-    let image: Vec<u8> = (0..IMAGE_BYTES).map(|i| (i * 7 >> 3) as u8).collect();
+    let image: Vec<u8> = (0..IMAGE_BYTES).map(|i| ((i * 7) >> 3) as u8).collect();
     let limits = policy.limits();
     let fit = |decision: &Decision| limits.clamp(decision.action) == decision.action;
     let mut executed = None;
