@@ -11,7 +11,7 @@ use rcwm_models::errors::one_line;
 
 use super::handover::Handover;
 use super::message::{self, Answer, Request};
-use super::{SwapSettings, prepare, priority};
+use super::{SwapError, SwapSettings, prepare, priority};
 use crate::policy::Policy;
 
 /// How often the desk looks for somebody who asks.
@@ -74,13 +74,33 @@ impl Desk {
         };
         message::say(stream, &Answer::Loading)?;
         let start = Instant::now();
-        match prepare::prepare(&request.bundle, &self.settings) {
+        match self.prepare(&request) {
             Ok(policy) => {
                 message::say(stream, &Answer::Ready { prepared_s: start.elapsed().as_secs_f64() })?;
                 self.hand_over(stream, policy, &request)
             }
             Err(error) => refuse(one_line(&error)),
         }
+    }
+
+    fn prepare(&self, request: &Request) -> Result<Policy, SwapError> {
+        let before = priority::threads().map_err(SwapError::Helpers)?;
+        let policy = prepare::prepare(&request.bundle, &self.settings)?;
+        // What the run itself has started meanwhile is among them: it gets what it would have inherited.
+        let helpers = &priority::threads().map_err(SwapError::Helpers)? - &before;
+        while !helpers.is_empty() && !self.stopped() {
+            if let Some(ticking) = self.handover.ticking() {
+                let given = helpers.iter().try_for_each(|to| match priority::give(ticking, *to) {
+                    // It has ended since.
+                    Err(error) if error.raw_os_error() == Some(libc::ESRCH) => Ok(()),
+                    other => other,
+                });
+                given.map_err(SwapError::Helpers)?;
+                break;
+            }
+            std::thread::park_timeout(LOOK);
+        }
+        Ok(policy)
     }
 
     /// Until the policy is taken, or nobody wants it any more.

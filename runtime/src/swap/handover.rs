@@ -1,6 +1,6 @@
 //! The one place where two threads meet: the desk puts a policy, the controller exchanges it for its own.
 
-use std::sync::atomic::{AtomicU8, Ordering};
+use std::sync::atomic::{AtomicI32, AtomicU8, Ordering};
 use std::sync::{Mutex, PoisonError};
 
 use super::When;
@@ -25,11 +25,13 @@ pub(super) struct Handover<T = Policy> {
     state: AtomicU8,
     /// The desk's policy, then the controller's old one. The desk holds the lock for moments, and never while it works.
     place: Mutex<Option<T>>,
+    /// The controller's thread, once it has looked in; else 0.
+    ticking: AtomicI32,
 }
 
 impl<T> Default for Handover<T> {
     fn default() -> Self {
-        Self { state: AtomicU8::new(EMPTY), place: Mutex::new(None) }
+        Self { state: AtomicU8::new(EMPTY), place: Mutex::new(None), ticking: AtomicI32::new(0) }
     }
 }
 
@@ -42,6 +44,11 @@ impl<T> Handover<T> {
         };
         *self.place.lock().unwrap_or_else(PoisonError::into_inner) = Some(policy);
         self.state.store(ready, Ordering::Release);
+    }
+
+    /// Desk: the thread that ticks, once it has looked in.
+    pub(super) fn ticking(&self) -> Option<i32> {
+        Some(self.ticking.load(Ordering::Relaxed)).filter(|thread| *thread != 0)
     }
 
     /// Desk: the controller's old policy, once it has taken the new one.
@@ -69,6 +76,7 @@ impl<T> Handover<T> {
 
     /// Controller: see [`super::Swapper::poll`]. Never waits: where the desk has the lock, the next tick looks again.
     pub(super) fn exchange(&self, moment: Moment, policy: &mut T) -> bool {
+        self.ticking.store(rustix::thread::gettid().as_raw_nonzero().get(), Ordering::Relaxed);
         let wanted = match self.state.load(Ordering::Acquire) {
             READY_NOW => true,
             READY_FOR_EPISODE => moment == Moment::BetweenEpisodes,

@@ -75,6 +75,12 @@ pub enum SwapError {
     /// Loading panicked; the thread that loads has gone on.
     #[error("loading the bundle failed inside the engine: {0}; export it again")]
     Panicked(String),
+    /// The engine's own threads would be slower than the one that ticks.
+    #[error(
+        "the threads that the engine has started for the bundle cannot get the priority of the run: {0}; use --threads 1, or give \
+         the run CAP_SYS_NICE"
+    )]
+    Helpers(io::Error),
     /// The desk could not be opened.
     #[error(
         "opening the swap desk {name:?}: {source}; another run with this instance and RCWM_PREFIX may have it"

@@ -1,5 +1,6 @@
 //! A stream of recorded images at a fixed rate, and what was answered when.
 
+use std::collections::HashMap;
 use std::sync::atomic::{AtomicBool, AtomicUsize, Ordering};
 use std::time::Duration;
 
@@ -7,13 +8,10 @@ use anyhow::Context;
 use rcwm_models::IMAGE_BYTES;
 use rcwm_models::bundle::Bundle;
 use rcwm_models::wire::clock::monotonic_ns;
-use rcwm_models::wire::{ActionSource, ObservationFlags, SimulatorLink, Wait};
+use rcwm_models::wire::{Action, ActionSource, ObservationFlags, SimulatorLink, Wait};
 use rustix::thread::clock_nanosleep_absolute;
 use rustix::time::{ClockId, Timespec};
 use serde::Serialize;
-
-/// Later than this after it was due, an observation counts as published late, in periods.
-const PUBLISHED_LATE_PERIODS: f64 = 0.5;
 
 /// One phase.
 #[derive(Debug, Clone, Default, Serialize)]
@@ -24,7 +22,7 @@ pub(crate) struct PhaseReport {
     in_time: u64,
     /// Answered later, or not at all.
     missed: u64,
-    /// Those of them that the stream itself had published late.
+    /// Those of them that were answered within a period of being published: the stream itself was late.
     missed_published_late: u64,
     /// Answered by something else than the policy.
     not_by_policy: u64,
@@ -50,6 +48,8 @@ pub(crate) struct Stream<'a> {
     episode: u64,
     sequence: u64,
     last_action: [f32; 4],
+    /// When what was not answered in time was published, by sequence.
+    unanswered: HashMap<u64, u64>,
 }
 
 impl<'a> Stream<'a> {
@@ -66,7 +66,8 @@ impl<'a> Stream<'a> {
         anyhow::ensure!(!images.is_empty(), "the bundle has no golden image");
         anyhow::ensure!((1.0..=10_000.0).contains(&rate_hz), "--rate-hz {rate_hz}: expected 1 to 10000");
         let period_ns = (1e9 / rate_hz) as u64;
-        Ok(Self { peer, images, period_ns, episode: u64::from(episode), sequence: 0, last_action: [0.0; 4] })
+        let (episode, unanswered) = (u64::from(episode), HashMap::new());
+        Ok(Self { peer, images, period_ns, episode, sequence: 0, last_action: [0.0; 4], unanswered })
     }
 
     fn publish(&mut self, scheduled_ns: u64, repeated: bool) -> anyhow::Result<()> {
@@ -141,18 +142,27 @@ impl<'a> Stream<'a> {
                         report.in_time += 1;
                         return Ok(());
                     }
-                    break;
+                    self.unanswered.insert(self.sequence, published_ns);
+                    self.note_late(&action, report);
+                    report.missed += 1;
+                    return Ok(());
                 }
-                // A late answer to an earlier one.
-                Wait::Message(_) => {}
+                Wait::Message(action) => self.note_late(&action, report),
                 _ if monotonic_ns() >= deadline_ns => break,
                 _ => {}
             }
         }
+        self.unanswered.insert(self.sequence, published_ns);
         report.missed += 1;
-        let late_ns = published_ns.saturating_sub(due_ns) as f64;
-        report.missed_published_late += u64::from(late_ns > PUBLISHED_LATE_PERIODS * self.period_ns as f64);
         Ok(())
+    }
+
+    /// An answer after its deadline: whose fault was it?
+    fn note_late(&mut self, action: &Action, report: &mut PhaseReport) {
+        if let Some(published_ns) = self.unanswered.remove(&action.answers) {
+            let in_time = action.published_ns <= published_ns + self.period_ns;
+            report.missed_published_late += u64::from(in_time);
+        }
     }
 }
 
