@@ -5,6 +5,7 @@ use std::os::fd::AsRawFd;
 use std::os::unix::net::{UnixListener, UnixStream};
 use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, Ordering};
+use std::sync::mpsc::{Receiver, Sender};
 use std::time::{Duration, Instant};
 
 use rcwm_models::errors::one_line;
@@ -26,6 +27,7 @@ pub(super) struct Desk {
     listener: UnixListener,
     handover: Arc<Handover>,
     stop: Arc<AtomicBool>,
+    sweeper: Sender<Policy>,
 }
 
 impl Desk {
@@ -34,8 +36,9 @@ impl Desk {
         listener: UnixListener,
         handover: Arc<Handover>,
         stop: Arc<AtomicBool>,
+        sweeper: Sender<Policy>,
     ) -> Self {
-        Self { settings, listener, handover, stop }
+        Self { settings, listener, handover, stop, sweeper }
     }
 
     fn stopped(&self) -> bool {
@@ -125,12 +128,26 @@ impl Desk {
             std::thread::park_timeout(LOOK_READY);
         };
         let waited_s = start.elapsed().as_secs_f64();
-        // Here, and not on the thread that ticks.
-        drop(old);
+        if let Some(old) = old {
+            // It is there until this thread has ended.
+            let _ = self.sweeper.send(old);
+        }
         let (preset, updates) = (provenance.preset, provenance.updates);
         let answer = answer.unwrap_or(Answer::Taken { task, preset, updates, waited_s });
         stream.set_nonblocking(false)?;
         message::say(stream, &answer)
+    }
+}
+
+/// Drops old policies, on a thread that is not of low priority: their memory belongs to the thread that has ticked with them, and whoever
+/// gives it back holds that thread's allocator for a moment. One that is not scheduled meanwhile would hold up a tick.
+pub(super) fn sweep(policies: &Receiver<Policy>, handover: &Handover) {
+    for old in policies {
+        if let Some(ticking) = handover.ticking() {
+            // Where that is not allowed, the priority it was started with must do.
+            let _ = priority::give(ticking, 0);
+        }
+        drop(old);
     }
 }
 

@@ -9,7 +9,7 @@
 //! ```
 //!
 //! The controller's thread never loads, waits, allocates or frees for a swap: it moves the new policy out of the [`Handover`] and the
-//! old one in, for the desk's thread to drop. A bundle that is damaged, that was made for another rate, that misses its
+//! old one in, for a third thread to drop. A bundle that is damaged, that was made for another rate, that misses its
 //! golden values or holds numbers that are not finite is refused with one line, and the old policy runs on.
 //!
 //! **When.** At an episode's start, or at once (`--now`), between two ticks.
@@ -31,6 +31,7 @@ use std::io;
 use std::os::unix::net::UnixListener;
 use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, Ordering};
+use std::sync::mpsc::channel;
 use std::thread::JoinHandle;
 
 use rcwm_models::bundle::BundleError;
@@ -128,7 +129,8 @@ pub struct SwapSettings {
 pub struct Swapper {
     handover: Arc<Handover>,
     stop: Arc<AtomicBool>,
-    thread: Option<JoinHandle<()>>,
+    desk: Option<JoinHandle<()>>,
+    sweeper: Option<JoinHandle<()>>,
 }
 
 impl Swapper {
@@ -142,9 +144,13 @@ impl Swapper {
         let listener = message::address(&name).and_then(|at| UnixListener::bind_addr(&at)).map_err(failed)?;
         listener.set_nonblocking(true).map_err(failed)?;
         let (handover, stop) = (Arc::new(Handover::default()), Arc::new(AtomicBool::new(false)));
-        let desk = Desk::new(settings, listener, Arc::clone(&handover), Arc::clone(&stop));
-        let thread = std::thread::Builder::new().name("swap".into()).spawn(move || desk.serve());
-        Ok(Self { handover, stop, thread: Some(thread.map_err(failed)?) })
+        let (old, policies) = channel();
+        let named = |name: &str| std::thread::Builder::new().name(name.into());
+        let shared = Arc::clone(&handover);
+        let sweeper = named("swap-sweeper").spawn(move || desk::sweep(&policies, &shared)).map_err(failed)?;
+        let desk = Desk::new(settings, listener, Arc::clone(&handover), Arc::clone(&stop), old);
+        let desk = named("swap").spawn(move || desk.serve()).map_err(failed)?;
+        Ok(Self { handover, stop, desk: Some(desk), sweeper: Some(sweeper) })
     }
 
     /// Exchanges `policy` for one that is ready and wanted at this moment; true if so. To be called by the thread that ticks, in its
@@ -159,9 +165,10 @@ impl Swapper {
 impl Drop for Swapper {
     fn drop(&mut self) {
         self.stop.store(true, Ordering::Relaxed);
-        if let Some(thread) = self.thread.take() {
+        // The desk first: the sweeper ends when nobody can bring it anything.
+        for thread in self.desk.take().into_iter().chain(self.sweeper.take()) {
             thread.thread().unpark();
-            // A panic there was reported to the one who asked; there is nothing left to do about it.
+            // A panic there has been printed; there is nothing left to do about it.
             let _ = thread.join();
         }
     }
