@@ -12,6 +12,7 @@
 //! | [`pacing`] | when the next observation is due, how to wait for it, when it counts as late |
 //! | [`realtime`] | what Linux grants a thread that must be on time |
 //! | [`telemetry`] | latency histograms, one per stage |
+//! | [`swap`] | another policy in place of the running one |
 //! | [`record`] | films, strips and episodes of what the policy saw, written beside the loop |
 //! | [`mod@log`] | every tick of a run, replayed bit for bit or turned into episodes |
 //! | [`verify`] | a bundle against its golden values |
@@ -49,6 +50,7 @@ pub mod pacing;
 pub mod policy;
 pub mod realtime;
 pub mod record;
+pub mod swap;
 pub mod team;
 pub mod telemetry;
 pub mod verify;

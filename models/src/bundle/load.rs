@@ -3,6 +3,9 @@
 use std::collections::BTreeMap;
 use std::path::{Component, Path, PathBuf};
 
+use prost::Message;
+
+use super::graph::{self, GraphError};
 use super::manifest::{FORMAT, FileEntry, Manifest, PartEntry, PartName, TensorSpec};
 use super::{DType, GOLDEN_BYTES_MAX, MANIFEST_BYTES_MAX, MANIFEST_FILE, PART_BYTES_MAX};
 use crate::files::{FileError, read_capped, sha256_hex};
@@ -74,6 +77,14 @@ pub enum BundleError {
         /// What is wrong.
         source: OnnxError,
     },
+    /// A part's graph does something that it must not.
+    #[error("bundle: {part}: {source}; export it again with the matching trainer")]
+    Graph {
+        /// The part.
+        part: PartName,
+        /// What it does.
+        source: GraphError,
+    },
     /// A part's inputs or outputs are not those of the contract.
     #[error("bundle: {part}: {role} are {found}, expected {expected}")]
     Signature {
@@ -119,7 +130,7 @@ pub struct Bundle {
     pub folder: PathBuf,
     /// The manifest.
     pub manifest: Manifest,
-    /// The ONNX files' bytes.
+    /// The ONNX files' bytes, without what the checks do not know: an engine sees nothing that was not checked.
     pub parts: BTreeMap<PartName, Vec<u8>>,
     /// The initial state.
     pub initial: InitialState,
@@ -137,8 +148,8 @@ impl Bundle {
         let mut parts = BTreeMap::new();
         for entry in &manifest.parts {
             let bytes = read_entry(folder, &entry.file_entry(), PART_BYTES_MAX)?;
-            check_graph(entry, &bytes)?;
-            parts.insert(entry.name, bytes);
+            let model = check_graph(entry, &bytes, manifest.model.classes)?;
+            parts.insert(entry.name, model.encode_to_vec());
         }
         let initial = read_tensors(folder, &manifest.initial, INITIAL_BYTES_MAX)
             .and_then(|tensors| read_initial(&manifest, &tensors))?;
@@ -258,10 +269,10 @@ fn read_entry(folder: &Path, entry: &FileEntry, bytes_max: u64) -> Result<Vec<u8
     Ok(bytes)
 }
 
-fn check_graph(entry: &PartEntry, bytes: &[u8]) -> Result<(), BundleError> {
+fn check_graph(entry: &PartEntry, bytes: &[u8], classes: usize) -> Result<onnx::Model, BundleError> {
     let part = entry.name;
     let model = onnx::parse_self_contained(bytes).map_err(|source| BundleError::Onnx { part, source })?;
-    let graph = model.graph.ok_or(BundleError::Onnx { part, source: OnnxError::NoGraph })?;
+    let graph = model.graph.as_ref().ok_or(BundleError::Onnx { part, source: OnnxError::NoGraph })?;
     let specs = |values: &[onnx::ValueInfo]| -> Option<Vec<TensorSpec>> {
         values
             .iter()
@@ -277,7 +288,9 @@ fn check_graph(entry: &PartEntry, bytes: &[u8]) -> Result<(), BundleError> {
     ] {
         expect_specs(part, role, &specs(values).unwrap_or_default(), expected)?;
     }
-    Ok(())
+    graph::check(&model, &entry.inputs, &entry.outputs, classes)
+        .map_err(|source| BundleError::Graph { part, source })?;
+    Ok(model)
 }
 
 impl DType {

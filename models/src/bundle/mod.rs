@@ -17,9 +17,11 @@
 //! A bundle comes from outside: nothing in it is believed before [`Bundle::open`] has checked version, sizes, names, paths and
 //! checksums, and that no ONNX file refers to data outside itself.
 
+mod graph;
 mod load;
 mod manifest;
 
+pub use graph::GraphError;
 pub use load::{Bundle, BundleError, InitialState};
 pub use manifest::{
     Control, DType, FORMAT, FileEntry, Manifest, PartEntry, PartName, Provenance, TensorSpec,

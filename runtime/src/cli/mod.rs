@@ -15,6 +15,7 @@ mod replay;
 mod run;
 mod safety;
 mod status;
+mod swap;
 mod telemetry;
 mod verify;
 
@@ -72,6 +73,7 @@ Examples:
   rcwm-runtime inspect --bundle models/bundles/debug
   rcwm-runtime verify --bundle models/bundles/debug
   rcwm-runtime run --bundle models/bundles/debug --instance demo --record runs/demo --json runs/demo.json
+  rcwm-runtime swap --instance demo --bundle models/bundles/debug --now
   rcwm-runtime bench --bundle models/bundles/debug --engine all --ticks 2000
   rcwm-runtime replay --log runs/demo.rcwmlog --bundle models/bundles/debug
 
@@ -87,6 +89,8 @@ Environment:
 enum Verb {
     /// Answers a simulator's (or a robot's) observations over shared memory
     Run(Box<run::RunArguments>),
+    /// Has a run take over another bundle, without a missed tick
+    Swap(swap::SwapArguments),
     /// Checks a bundle against its golden values: every part and the whole tick
     Verify(verify::VerifyArguments),
     /// Shows parts, shapes, sizes, operators, and what a tick costs
@@ -132,6 +136,7 @@ impl EngineChoice {
 pub fn main() -> ExitCode {
     let result = match Arguments::parse().verb {
         Verb::Run(arguments) => run::run(&arguments),
+        Verb::Swap(arguments) => swap::run(&arguments),
         Verb::Verify(arguments) => verify::run(&arguments),
         Verb::Inspect(arguments) => inspect::run(&arguments),
         Verb::Bench(arguments) => bench::run(&arguments),

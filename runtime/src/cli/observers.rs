@@ -63,6 +63,13 @@ pub(super) struct Left {
     log: Option<LogSummary>,
 }
 
+impl ObserverArguments {
+    /// Whether films and episodes are asked for.
+    pub(super) fn records(&self) -> bool {
+        self.record.is_some()
+    }
+}
+
 impl Observers {
     pub(super) fn start(
         arguments: &ObserverArguments,

@@ -6,6 +6,7 @@ use std::time::Duration;
 
 use anyhow::Context;
 use clap::Args;
+use rcwm_models::wire::LinkSettings;
 
 use super::observers::{Left, ObserverArguments, Observers};
 use super::safety::{SafetyArguments, TimeArguments};
@@ -14,6 +15,7 @@ use crate::controller::{Controller, ControllerError, ControllerSettings, Ended, 
 use crate::engine::{EngineKind, EngineSettings};
 use crate::log::LogSettings;
 use crate::policy::{Policy, Sampling};
+use crate::swap::{SwapSettings, Swapper};
 
 /// Arguments of `run`.
 #[derive(Debug, Args)]
@@ -88,6 +90,11 @@ pub(super) fn run(arguments: &RunArguments) -> anyhow::Result<()> {
     };
     let mut observers = Observers::start(&arguments.observers, &bundle, &policy, log)?;
     let mut controller = Controller::open(policy, settings)?;
+    // A recorder draws with the decoder of the bundle it was started with.
+    if !arguments.observers.records() {
+        let (link, rate_hz) = (LinkSettings::new(&arguments.instance), bundle.manifest.control.rate_hz);
+        controller.take_swaps(Swapper::start(SwapSettings { link, engine, sampling, rate_hz })?);
+    }
     let mut status = StatusLine::start(&arguments.instance).context("starting the status line")?;
     // Asked for last: the other threads stay ordinary ones.
     let granted = arguments.time.ask()?;

@@ -9,6 +9,7 @@ use super::{
     TickObserver, TickTimes, step,
 };
 use crate::policy::{Decision, PolicyError};
+use crate::swap::Moment;
 use crate::telemetry::Stage;
 
 /// A tick on its way to the observers.
@@ -85,6 +86,8 @@ impl Controller {
         if is_first {
             self.answer = None;
             self.gate.start_episode();
+            // Here only where the last episode was cut: else it happened in the idle time after its end.
+            self.swap(Moment::BetweenEpisodes);
         }
         let rewound = self.rewind(observation.sequence, is_first);
         let (decision, event) = self.decide(observation, is_first);
@@ -118,7 +121,9 @@ impl Controller {
         self.finish_episode(observation);
         if !overtaken {
             // Here the idle time begins.
-            self.work_ahead((!observation.is(ObservationFlags::LAST)).then_some(&answer.action));
+            let is_last = observation.is(ObservationFlags::LAST);
+            self.swap(if is_last { Moment::BetweenEpisodes } else { Moment::InEpisode });
+            self.work_ahead((!is_last).then_some(&answer.action));
         }
         Ok(Taken::New)
     }
@@ -142,6 +147,8 @@ impl Controller {
             self.counters.refused_observations += 1;
             return (None, Event::Unfit(Cause::Observation));
         }
+        // A new policy starts where it takes over, as at the first of an episode.
+        let is_first = is_first | std::mem::take(&mut self.fresh_policy);
         let decided =
             self.policy.observe(&observation.image, (!is_first).then_some(&observation.executed_action));
         let decision = match decided {
@@ -245,6 +252,10 @@ impl Controller {
         &mut self,
         sequence: u64,
     ) -> Result<(Option<Decision>, (ActionSource, [f32; ACTION_LEN])), ControllerError> {
+        if self.fresh_policy {
+            // It has seen nothing that it could go on from.
+            return Ok((None, (ActionSource::Fallback, self.settings.fallback.action(self.gate.last()))));
+        }
         let before = self.policy.state().clone();
         match self.policy.imagine(&self.gate.last().unwrap_or_default()) {
             Ok(decision) => {
@@ -302,7 +313,7 @@ impl Controller {
     fn work_ahead(&mut self, action: Option<&[f32; ACTION_LEN]>) {
         let start_ns = monotonic_ns();
         // See above: the tick tells.
-        let _ = self.policy.work_ahead(action);
+        let _ = self.policy.work_ahead(action.filter(|_| !self.fresh_policy));
         self.telemetry.record(Stage::Ahead, monotonic_ns() - start_ns);
     }
 

@@ -76,6 +76,11 @@ impl Gate {
         Self { limits, rate_max: rate_max.map(|rate_max| rate_max.max(0.0)), last: None }
     }
 
+    /// Another policy, with limits of its own. What was sent last was sent.
+    pub fn take_limits(&mut self, limits: ActionLimits) {
+        self.limits = limits;
+    }
+
     /// The last action sent in this episode.
     #[must_use]
     pub fn last(&self) -> Option<[f32; ACTION_LEN]> {

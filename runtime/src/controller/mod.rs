@@ -37,6 +37,7 @@ use rcwm_models::wire::{Action, ControllerLink, LinkSettings, ObservationSample,
 
 use crate::pacing::{Pacing, PacingSettings, Plan};
 use crate::policy::{self, Policy};
+use crate::swap::{Moment, Swapper};
 use crate::telemetry::Telemetry;
 use surprise::SurpriseTelemetry;
 
@@ -115,6 +116,9 @@ pub struct Controller {
     newer: Option<ObservationSample>,
     /// An overdue tick was given its last chance.
     looked: bool,
+    swapper: Option<Swapper>,
+    /// The policy was exchanged: the next observation is the first of an episode to it.
+    fresh_policy: bool,
 }
 
 /// What the link has brought.
@@ -163,7 +167,33 @@ impl Controller {
             looked: false,
             policy,
             settings,
+            swapper: None,
+            fresh_policy: false,
         })
+    }
+
+    /// Takes over policies that are ready at a swap desk.
+    pub fn take_swaps(&mut self, swapper: Swapper) {
+        self.swapper = Some(swapper);
+    }
+
+    /// Takes over a policy that is ready. What was imagined was the old one's.
+    fn swap(&mut self, moment: Moment) {
+        if let Some(swapper) = &self.swapper
+            && swapper.poll(moment, &mut self.policy)
+        {
+            self.gate.take_limits(self.policy.limits());
+            self.imagined.clear();
+            self.fresh_policy = true;
+            self.counters.swaps += 1;
+        }
+    }
+
+    /// Nothing came: time for what need not be done in a tick.
+    fn idle(&mut self, heard: Instant, asked: &mut Instant) -> Result<(), ControllerError> {
+        self.swap(if self.running.is_some() { Moment::InEpisode } else { Moment::BetweenEpisodes });
+        self.bear_silence(heard)?;
+        self.ask_again(heard, asked)
     }
 
     /// Answers observations until the simulator closes, enough episodes are done, or `stop` is set.
@@ -196,8 +226,7 @@ impl Controller {
                 }
             };
             if taken == Taken::Nothing {
-                self.bear_silence(heard)?;
-                self.ask_again(heard, &mut asked)?;
+                self.idle(heard, &mut asked)?;
             } else {
                 heard = Instant::now();
             }

@@ -58,6 +58,8 @@ pub struct Counters {
     pub peer_restarts: u64,
     /// A peer was silent for so long that the controller fell silent too.
     pub peers_lost: u64,
+    /// Policies taken over while running.
+    pub swaps: u64,
 }
 
 impl Counters {
@@ -287,6 +289,9 @@ impl RunReport {
         text += &self.surprise_line();
         for line in self.realtime.iter().flat_map(Granted::lines) {
             text += &format!("realtime   {line}\n");
+        }
+        if c.swaps > 0 {
+            text += &format!("swaps      {} policies taken over while running\n", c.swaps);
         }
         if self.frames_dropped > 0 {
             text += &format!("recording  {} frames dropped\n", self.frames_dropped);

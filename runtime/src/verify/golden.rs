@@ -146,7 +146,18 @@ impl<'a> Golden<'a> {
         output: &str,
         tick: usize,
     ) -> Result<&'a [i64], VerifyError> {
-        self.i64(&expect_name(part, output), tick)
+        let name = expect_name(part, output);
+        let indices = self.i64(&name, tick)?;
+        let classes = self.bundle.manifest.model.classes as i64;
+        // They enter parts as indices of a table's rows.
+        match indices.iter().find(|class| !(0..classes).contains(*class)) {
+            None => Ok(indices),
+            Some(class) => Err(self.wrong(TensorsError::Unexpected {
+                name,
+                found: format!("class {class} at tick {tick}"),
+                expected: format!("classes 0 to {}", classes - 1),
+            })),
+        }
     }
 
     /// The state after a tick.

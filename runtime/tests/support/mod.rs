@@ -13,6 +13,7 @@ use rcwm_models::IMAGE_BYTES;
 use rcwm_models::bundle::{Bundle, MANIFEST_FILE, Manifest, PartName};
 use rcwm_models::files::sha256_hex;
 use rcwm_models::onnx::{Graph, Model, Node, Tensor, data_type};
+use rcwm_models::tensors::Values;
 use rcwm_models::wire::{
     Action, LinkSettings, Observation, ObservationFlags, SimulatorLink, Wait, forget_prefix,
 };
@@ -189,6 +190,19 @@ pub fn start_changed<T: Send + 'static>(
         ControllerSettings { first_timeout: Some(NEVER), ..ControllerSettings::new(link.0.clone()) };
     change(&mut settings);
     std::thread::spawn(move || run(&mut Controller::open(policy, settings).unwrap()))
+}
+
+/// A copy of the smallest bundle with the golden mean actions changed, with the right checksum.
+pub fn with_golden(change: impl Fn(f32) -> f32) -> tempfile::TempDir {
+    let mut golden = Bundle::open(&smallest_bundle()).unwrap().golden;
+    let Some(Values::F32(mean)) = golden.0.get_mut("expect/actor/mean") else { panic!("no golden mean") };
+    mean.mapv_inplace(change);
+    let bytes = golden.to_bytes().unwrap();
+    let copy = with_manifest(|manifest| {
+        (manifest.golden.bytes, manifest.golden.sha256) = (bytes.len() as u64, sha256_hex(&bytes));
+    });
+    std::fs::write(copy.path().join("golden.safetensors"), bytes).unwrap();
+    copy
 }
 
 /// An observation of an episode that begins at step 0, with an image of its own.

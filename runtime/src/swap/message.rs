@@ -1,0 +1,161 @@
+//! What is said between the one who asks and the desk: one request and some answers, each a line of JSON, over a Unix socket.
+//!
+//! The socket has a name but no file (Linux, abstract): nothing is left behind by a run that is killed, and its name is free at once.
+//! The desk serves its own user and root only. Containers meet where they share the network namespace.
+
+use std::io::{self, BufRead, BufReader, Read, Write};
+use std::net::Shutdown;
+use std::os::linux::net::SocketAddrExt;
+use std::os::unix::net::{SocketAddr, UnixStream};
+use std::path::{Path, PathBuf};
+use std::sync::atomic::{AtomicBool, Ordering};
+use std::time::{Duration, Instant};
+
+use rcwm_models::wire::LinkSettings;
+use serde::{Deserialize, Serialize};
+
+use super::SwapError;
+
+/// Version of this conversation.
+pub(super) const VERSION: u32 = 1;
+/// Longest line.
+const LINE_BYTES_MAX: u64 = 64 << 10;
+/// How often the one who asks looks at its stop flag.
+const LOOK: Duration = Duration::from_millis(100);
+
+/// When the new policy takes over.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(rename_all = "lowercase")]
+pub enum When {
+    /// At the start of the next episode.
+    Episode,
+    /// After the tick that is running.
+    Now,
+}
+
+/// What is asked of the desk.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub(super) struct Request {
+    pub(super) version: u32,
+    pub(super) bundle: PathBuf,
+    pub(super) when: When,
+}
+
+/// What the desk says.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[serde(tag = "state", rename_all = "lowercase")]
+pub enum Answer {
+    /// It loads and verifies the bundle.
+    Loading,
+    /// The policy is ready and waits for its moment.
+    Ready {
+        /// Time it took to load, verify and warm up, in s.
+        prepared_s: f64,
+    },
+    /// The policy runs.
+    Taken {
+        /// Task of the bundle.
+        task: String,
+        /// Preset of the bundle.
+        preset: String,
+        /// World-model updates behind it.
+        updates: u64,
+        /// Time from ready to taken, in s.
+        waited_s: f64,
+    },
+    /// The bundle was not taken; the old policy runs on.
+    Refused {
+        /// Why, on one line.
+        reason: String,
+    },
+    /// The one who asked has hung up before the moment came; the old policy runs on.
+    Withdrawn,
+}
+
+impl Answer {
+    /// Whether it is the last.
+    #[must_use]
+    pub fn is_final(&self) -> bool {
+        matches!(self, Self::Taken { .. } | Self::Refused { .. } | Self::Withdrawn)
+    }
+}
+
+pub(super) fn desk_name(link: &LinkSettings) -> String {
+    format!("rcwm-swap/{}/{}", link.prefix.as_deref().unwrap_or(""), link.instance)
+}
+
+pub(super) fn address(name: &str) -> io::Result<SocketAddr> {
+    SocketAddr::from_abstract_name(name)
+}
+
+/// Writes one line.
+pub(super) fn say(mut stream: &UnixStream, message: &impl Serialize) -> io::Result<()> {
+    let mut line = serde_json::to_vec(message)?;
+    line.push(b'\n');
+    stream.write_all(&line)
+}
+
+/// Reads one line; nothing is read after it.
+pub(super) fn hear(stream: &UnixStream) -> io::Result<Request> {
+    let mut line = String::new();
+    BufReader::new(stream.take(LINE_BYTES_MAX)).read_line(&mut line)?;
+    Ok(serde_json::from_str(&line)?)
+}
+
+/// Asks the run on an instance to take over a bundle, and waits until it has or has not.
+///
+/// `listen` is called with every answer. When `stop` is set or `patience` is over before the bundle was taken, it is withdrawn.
+///
+/// # Errors
+/// [`SwapError::NoDesk`] and [`SwapError::Conversation`]; a bundle that is refused is [`Answer::Refused`].
+pub fn ask(
+    link: &LinkSettings,
+    bundle: &Path,
+    when: When,
+    patience: Option<Duration>,
+    stop: &AtomicBool,
+    listen: &mut dyn FnMut(&Answer),
+) -> Result<Answer, SwapError> {
+    let no_desk = |source| SwapError::NoDesk { instance: link.instance.clone(), source };
+    let stream = address(&desk_name(link)).and_then(|at| UnixStream::connect_addr(&at)).map_err(no_desk)?;
+    let broken = |error: io::Error| SwapError::Conversation(format!("broke off: {error}"));
+    // The run may lie elsewhere in the file system than the one who asks.
+    let bundle = std::path::absolute(bundle).map_err(broken)?;
+    say(&stream, &Request { version: VERSION, bundle, when }).map_err(broken)?;
+    stream.set_read_timeout(Some(LOOK)).map_err(broken)?;
+    let start = Instant::now();
+    let (mut lines, mut line, mut leaving) = (BufReader::new(&stream), Vec::new(), false);
+    loop {
+        match lines.read_until(b'\n', &mut line) {
+            Ok(0) => {
+                let text = "has ended without an answer; whether it took the bundle is not known";
+                return Err(SwapError::Conversation(text.into()));
+            }
+            Ok(_) if line.ends_with(b"\n") => {
+                let not_understood = |error| SwapError::Conversation(format!("is not understood: {error}"));
+                let answer: Answer = serde_json::from_slice(&line).map_err(not_understood)?;
+                listen(&answer);
+                if answer.is_final() {
+                    return Ok(answer);
+                }
+                line.clear();
+            }
+            // The end of the stream inside a line shows at the next read.
+            Ok(_) => {}
+            Err(error) if is_timeout(&error) => {}
+            Err(error) => return Err(broken(error)),
+        }
+        let over = patience.is_some_and(|patience| start.elapsed() >= patience);
+        if !leaving && (over || stop.load(Ordering::Relaxed)) {
+            // The desk sees that we leave, and still says how it ended.
+            stream.shutdown(Shutdown::Write).map_err(broken)?;
+            leaving = true;
+        }
+    }
+}
+
+pub(super) fn is_timeout(error: &io::Error) -> bool {
+    use io::ErrorKind::{Interrupted, TimedOut, WouldBlock};
+    matches!(error.kind(), Interrupted | TimedOut | WouldBlock)
+}

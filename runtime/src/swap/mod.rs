@@ -1,0 +1,175 @@
+//! Another policy in place of the running one, without a missed tick.
+//!
+//! ```text
+//! rcwm-runtime swap --instance arm --bundle DIR        asks, waits, says what happened
+//!        |  socket of the instance
+//!   desk's thread, lowest priority        loads the bundle, verifies it against its golden values, warms it up
+//!        |  handover                      one place; nobody waits for it
+//!   controller's thread                   looks in after an action was sent, and exchanges the two policies
+//! ```
+//!
+//! The controller's thread never loads, waits, allocates or frees for a swap: it moves the new policy out of the [`Handover`] and the
+//! old one in, for a third thread to drop. A bundle that is damaged, that was made for another rate, that misses its
+//! golden values or holds numbers that are not finite is refused with one line, and the old policy runs on.
+//!
+//! **When.** At an episode's start, or at once (`--now`), between two ticks.
+//!
+//! **State.** The new policy always starts from its own learned initial state, also in the middle of an episode: latents of two trainings
+//! mean different things even where their sizes match. It was trained like that: every training sequence begins so, wherever in an
+//! episode it was cut from.
+
+mod desk;
+mod handover;
+mod message;
+mod prepare;
+mod priority;
+
+pub use handover::Moment;
+pub use message::{Answer, When, ask};
+
+use std::io;
+use std::os::unix::net::UnixListener;
+use std::sync::Arc;
+use std::sync::atomic::{AtomicBool, Ordering};
+use std::sync::mpsc::channel;
+use std::thread::JoinHandle;
+
+use rcwm_models::bundle::BundleError;
+use rcwm_models::wire::LinkSettings;
+
+use crate::engine::EngineSettings;
+use crate::policy::{Policy, PolicyError, Sampling};
+use crate::verify::VerifyError;
+use desk::Desk;
+use handover::Handover;
+
+/// Why a bundle was not taken over, or nobody could be asked.
+#[derive(Debug, thiserror::Error)]
+pub enum SwapError {
+    /// The bundle was refused.
+    #[error(transparent)]
+    Bundle(#[from] BundleError),
+    /// The policy does not load or run.
+    #[error(transparent)]
+    Policy(#[from] PolicyError),
+    /// It cannot be told whether the bundle computes what it should.
+    #[error(transparent)]
+    Verify(#[from] VerifyError),
+    /// The bundle computes something else than the trainer did.
+    #[error("golden values are missed: {first}{}; export the bundle again", more(*others))]
+    NotVerified {
+        /// What is wrong first.
+        first: String,
+        /// How much else is.
+        others: usize,
+    },
+    /// The bundle was made for another pace.
+    #[error(
+        "the bundle decides at {found} Hz, the running one at {expected} Hz; export it for the same rate, or start a new run"
+    )]
+    Rate {
+        /// The new bundle's rate, in Hz.
+        found: f64,
+        /// The running bundle's rate, in Hz.
+        expected: f64,
+    },
+    /// Loading panicked; the thread that loads has gone on.
+    #[error("loading the bundle failed inside the engine: {0}; export it again")]
+    Panicked(String),
+    /// The engine's own threads would be slower than the one that ticks.
+    #[error(
+        "the threads that the engine has started for the bundle cannot get the priority of the run: {0}; use --threads 1, or give \
+         the run CAP_SYS_NICE"
+    )]
+    Helpers(io::Error),
+    /// The desk could not be opened.
+    #[error(
+        "opening the swap desk {name:?}: {source}; another run with this instance and RCWM_PREFIX may have it"
+    )]
+    Desk {
+        /// Name of the socket.
+        name: String,
+        /// What the system said.
+        source: io::Error,
+    },
+    /// Nobody answers.
+    #[error(
+        "no run on instance {instance:?} takes swaps: {source}; start `rcwm-runtime run --instance {instance}` (same machine, \
+         same RCWM_PREFIX, without --record)"
+    )]
+    NoDesk {
+        /// The instance.
+        instance: String,
+        /// What the system said.
+        source: io::Error,
+    },
+    /// The run ended or spoke in a way that is not understood.
+    #[error("the run on the instance {0}")]
+    Conversation(String),
+}
+
+fn more(others: usize) -> String {
+    if others > 0 { format!(" (and {others} more)") } else { String::new() }
+}
+
+/// How the desk prepares a policy.
+#[derive(Debug, Clone)]
+pub struct SwapSettings {
+    /// The controller's link; names the desk.
+    pub link: LinkSettings,
+    /// Engine of the policies.
+    pub engine: EngineSettings,
+    /// How they choose latents and actions.
+    pub sampling: Sampling,
+    /// Decisions per second of the running policy, in Hz; another policy must have the same.
+    pub rate_hz: f64,
+}
+
+/// The controller's end: takes over a policy that is ready.
+pub struct Swapper {
+    handover: Arc<Handover>,
+    stop: Arc<AtomicBool>,
+    desk: Option<JoinHandle<()>>,
+    sweeper: Option<JoinHandle<()>>,
+}
+
+impl Swapper {
+    /// Opens the desk of an instance and starts its thread.
+    ///
+    /// # Errors
+    /// [`SwapError::Desk`].
+    pub fn start(settings: SwapSettings) -> Result<Self, SwapError> {
+        let name = message::desk_name(&settings.link);
+        let failed = |source| SwapError::Desk { name: name.clone(), source };
+        let listener = message::address(&name).and_then(|at| UnixListener::bind_addr(&at)).map_err(failed)?;
+        listener.set_nonblocking(true).map_err(failed)?;
+        let (handover, stop) = (Arc::new(Handover::default()), Arc::new(AtomicBool::new(false)));
+        let (old, policies) = channel();
+        let named = |name: &str| std::thread::Builder::new().name(name.into());
+        let shared = Arc::clone(&handover);
+        let sweeper = named("swap-sweeper").spawn(move || desk::sweep(&policies, &shared)).map_err(failed)?;
+        let desk = Desk::new(settings, listener, Arc::clone(&handover), Arc::clone(&stop), old);
+        let desk = named("swap").spawn(move || desk.serve()).map_err(failed)?;
+        Ok(Self { handover, stop, desk: Some(desk), sweeper: Some(sweeper) })
+    }
+
+    /// Exchanges `policy` for one that is ready and wanted at this moment; true if so. To be called by the thread that ticks, in its
+    /// idle time: reads one atomic, and takes a lock only if nobody has it.
+    ///
+    /// The new policy is in its initial state: its next observation is the first of an episode to it.
+    pub fn poll(&self, moment: Moment, policy: &mut Policy) -> bool {
+        self.handover.exchange(moment, policy)
+    }
+}
+
+impl Drop for Swapper {
+    fn drop(&mut self) {
+        self.stop.store(true, Ordering::Relaxed);
+        // The desk first: the sweeper ends when nobody can bring it anything.
+        for thread in self.desk.take().into_iter().chain(self.sweeper.take()) {
+            thread.thread().unpark();
+            // A panic there has been printed; there is nothing left to do about it.
+            let _ = thread.join();
+        }
+    }
+}

@@ -1,0 +1,211 @@
+//! Policies exchanged under a running controller, asked for as a deployer asks.
+
+#![allow(clippy::unwrap_used, reason = "a test may panic")]
+
+mod support;
+
+use std::path::Path;
+use std::sync::atomic::{AtomicBool, Ordering};
+use std::thread::JoinHandle;
+
+use rcwm_models::bundle::PartName;
+use rcwm_models::wire::{ActionSource, ObservationFlags, SimulatorLink};
+use rcwm_runtime::controller::{Controller, Fallback, RunReport};
+use rcwm_runtime::policy::Sampling;
+use rcwm_runtime::swap::{Answer, SwapError, SwapSettings, Swapper, When, ask};
+use rcwm_runtime::{EngineKind, EngineSettings, Policy};
+use support::{OwnLink, dividing_by_zero, own_link, smallest_bundle, with_manifest, with_nan_weight};
+
+const EPISODE: u64 = 20;
+
+/// A controller that takes swaps; ends when the peer closes.
+fn start(link: &OwnLink) -> JoinHandle<RunReport> {
+    let policy = Policy::load(&smallest_bundle(), EngineSettings::tract()).unwrap();
+    let settings = SwapSettings {
+        link: link.0.clone(),
+        engine: EngineSettings::tract(),
+        sampling: Sampling::Mode,
+        rate_hz: policy.manifest().control.rate_hz,
+    };
+    let swapper = Swapper::start(settings).unwrap();
+    support::start_with(policy, link, Fallback::Hold, move |controller: &mut Controller| {
+        controller.take_swaps(swapper);
+        let ended = controller.run(&AtomicBool::new(false), &mut []).unwrap();
+        controller.report(EngineKind::Tract, ended)
+    })
+}
+
+/// Asks from a thread of its own, for a swap that must not keep the peer from going on.
+fn ask_aside(link: &OwnLink, bundle: &Path, when: When) -> JoinHandle<Result<Answer, SwapError>> {
+    let (link, bundle) = (link.0.clone(), bundle.to_path_buf());
+    std::thread::spawn(move || ask(&link, &bundle, when, None, &AtomicBool::new(false), &mut |_| {}))
+}
+
+/// A peer that plays episode after episode.
+struct Peer<'a> {
+    link: &'a SimulatorLink,
+    sequence: u64,
+}
+
+impl Peer<'_> {
+    fn step(&self) -> u32 {
+        (self.sequence % EPISODE) as u32
+    }
+
+    /// One observation, and the action that answers it: the policy's own, whatever happens beside it.
+    fn tick(&mut self) -> [f32; 4] {
+        let mut observation = support::observation(self.sequence, self.step());
+        observation.episode = self.sequence / EPISODE;
+        observation.flags |= if self.step() == 19 { ObservationFlags::LAST.0 } else { 0 };
+        let answer = support::ask(self.link, &observation);
+        assert_eq!(answer.source, ActionSource::Policy as u32, "sequence {}", self.sequence);
+        self.sequence += 1;
+        answer.action
+    }
+
+    /// Goes on until the one who asks has an answer.
+    fn tick_until<T>(&mut self, asked: JoinHandle<T>) -> T {
+        while !asked.is_finished() {
+            self.tick();
+        }
+        asked.join().unwrap()
+    }
+}
+
+/// The smallest bundle with other limits, so that its actions tell it from the first; golden values know no limits.
+fn other_bundle() -> tempfile::TempDir {
+    with_manifest(|manifest| {
+        (manifest.control.action_low, manifest.control.action_high) = ([0.5; 4], [0.75; 4]);
+    })
+}
+
+fn is_of_other(action: [f32; 4]) -> bool {
+    action.iter().all(|x| (0.5..=0.75).contains(x))
+}
+
+#[test]
+fn a_new_bundle_takes_over_at_an_episode_s_start_and_no_tick_is_lost() {
+    let link = own_link();
+    let peer = link.peer();
+    let controller = start(&link);
+    let other = other_bundle();
+    let mut peer_ticks = Peer { link: &peer, sequence: 0 };
+    assert!(!is_of_other(peer_ticks.tick()));
+    let answer = peer_ticks.tick_until(ask_aside(&link, other.path(), When::Episode)).unwrap();
+    assert!(matches!(answer, Answer::Taken { .. }), "{answer:?}");
+    assert!(is_of_other(peer_ticks.tick()));
+    peer.close().unwrap();
+    let report = controller.join().unwrap();
+    assert_eq!((report.counters.swaps, report.counters.fallback_answers), (1, 0));
+    assert_eq!(report.counters.missed_observations, 0);
+}
+
+#[test]
+fn a_bundle_taken_at_once_starts_from_its_initial_state_in_the_middle_of_an_episode() {
+    let link = own_link();
+    let peer = link.peer();
+    let controller = start(&link);
+    let mut peer_ticks = Peer { link: &peer, sequence: 0 };
+    for _ in 0..5 {
+        peer_ticks.tick();
+    }
+    // Nothing is asked of the controller meanwhile: it is in the middle of an episode, and takes over while it waits.
+    let answer = ask_aside(&link, &smallest_bundle(), When::Now).join().unwrap().unwrap();
+    assert!(matches!(answer, Answer::Taken { .. }), "{answer:?}");
+    let mut policy = Policy::load(&smallest_bundle(), EngineSettings::tract()).unwrap();
+    for step in 5..10 {
+        let executed = support::observation(step, step as u32).executed_action;
+        let image = support::image(step as u32);
+        let expected = policy.observe(&image, (step > 5).then_some(&executed)).unwrap();
+        assert_eq!(peer_ticks.tick(), expected.action, "step {step}");
+    }
+    peer.close().unwrap();
+    assert_eq!(controller.join().unwrap().counters.swaps, 1);
+}
+
+#[test]
+fn a_bad_bundle_is_refused_with_one_line_and_the_old_one_runs_on() {
+    let link = own_link();
+    let peer = link.peer();
+    let controller = start(&link);
+    let mut peer_ticks = Peer { link: &peer, sequence: 0 };
+    let slow = with_manifest(|manifest| manifest.control.rate_hz = 20.0);
+    let damaged = with_manifest(|manifest| manifest.parts[1].sha256.replace_range(..1, "x"));
+    let sizes = with_manifest(|manifest| manifest.model.deter *= 2);
+    let action = with_manifest(|manifest| manifest.model.action = 7);
+    let golden = support::with_golden(|mean| mean + 0.01);
+    let missing = tempfile::tempdir().unwrap();
+    for (bundle, word) in [
+        (with_nan_weight(PartName::Robot), "NaN"),
+        (dividing_by_zero(PartName::Actor), "not finite"),
+        (slow, "20 Hz"),
+        (damaged, "sha256"),
+        (sizes, "expected"),
+        (action, "action = 7"),
+        (golden, "golden"),
+        (missing, "manifest.toml"),
+    ] {
+        let answer = peer_ticks.tick_until(ask_aside(&link, bundle.path(), When::Now)).unwrap();
+        let Answer::Refused { reason } = answer else { panic!("{word}: {answer:?}") };
+        assert!(reason.contains(word) && !reason.contains('\n'), "{word}: {reason}");
+    }
+    peer_ticks.tick();
+    peer.close().unwrap();
+    let counters = controller.join().unwrap().counters;
+    assert_eq!((counters.swaps, counters.fallback_answers), (0, 0));
+}
+
+#[test]
+fn a_bundle_is_withdrawn_when_the_one_who_asked_leaves() {
+    let link = own_link();
+    let peer = link.peer();
+    let controller = start(&link);
+    let mut peer_ticks = Peer { link: &peer, sequence: 0 };
+    peer_ticks.tick();
+    let stop = AtomicBool::new(false);
+    // The episode does not end: nobody ticks.
+    let answer = ask(&link.0, other_bundle().path(), When::Episode, None, &stop, &mut |answer| {
+        stop.store(matches!(answer, Answer::Ready { .. }), Ordering::Relaxed);
+    });
+    assert_eq!(answer.unwrap(), Answer::Withdrawn);
+    (0..2 * EPISODE).for_each(|_| assert!(!is_of_other(peer_ticks.tick())));
+    peer.close().unwrap();
+    assert_eq!(controller.join().unwrap().counters.swaps, 0);
+}
+
+#[test]
+fn nobody_at_the_desk_is_one_line_that_says_what_to_do() {
+    let link = own_link();
+    let stop = AtomicBool::new(false);
+    let error = ask(&link.0, &smallest_bundle(), When::Now, None, &stop, &mut |_| {}).unwrap_err();
+    let line = error.to_string();
+    assert!(line.contains("rcwm-runtime run --instance test") && !line.contains('\n'), "{line}");
+}
+
+#[test]
+fn a_request_that_is_not_understood_is_refused_and_the_next_is_served() {
+    use std::io::{Read, Write};
+    use std::os::linux::net::SocketAddrExt;
+    use std::os::unix::net::{SocketAddr, UnixStream};
+    let link = own_link();
+    let peer = link.peer();
+    let controller = start(&link);
+    let name = format!("rcwm-swap/{}/{}", link.prefix(), link.0.instance);
+    for words in
+        [&b"please\n"[..], b"{\"version\":9,\"bundle\":\"x\",\"when\":\"now\"}\n", &[0xff; 100_000], b""]
+    {
+        let address = SocketAddr::from_abstract_name(&name).unwrap();
+        let mut stream = UnixStream::connect_addr(&address).unwrap();
+        // The desk may hang up before it has heard all of it.
+        let _ = stream.write_all(words).and_then(|()| stream.shutdown(std::net::Shutdown::Write));
+        let mut answer = Vec::new();
+        let _ = stream.read_to_end(&mut answer);
+        let answer = String::from_utf8(answer).unwrap();
+        assert!(answer.is_empty() || answer.contains("refused"), "{answer}");
+    }
+    let answer = ask_aside(&link, &smallest_bundle(), When::Now);
+    let mut peer_ticks = Peer { link: &peer, sequence: 0 };
+    assert!(matches!(peer_ticks.tick_until(answer).unwrap(), Answer::Taken { .. }));
+    peer.close().unwrap();
+    controller.join().unwrap();
+}
