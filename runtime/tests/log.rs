@@ -16,7 +16,7 @@ use rcwm_models::wire::{Action, ActionSource, Observation, ObservationFlags, Sim
 use rcwm_runtime::controller::{
     ControllerSettings, Counters, EpisodeResult, Fallback, State, Tick, TickObserver, TickTimes,
 };
-use rcwm_runtime::log::{Entry, LogReader, LogSettings, LogSummary, Logger, ReplayReport, Replayer};
+use rcwm_runtime::log::{Answers, Entry, LogReader, LogSettings, LogSummary, Logger, ReplayReport, Replayer};
 use rcwm_runtime::policy::{CallOutcome, Sampling};
 use rcwm_runtime::telemetry::Telemetry;
 use rcwm_runtime::{EngineSettings, Policy};
@@ -81,7 +81,7 @@ fn a_run_is_replayed_bit_for_bit_with_the_mode_and_with_samples() {
         assert_eq!(report.first_difference, None);
         assert_eq!((report.ticks, report.ticks_compared, report.log_finished), (60, 60, true));
         // The observations that hold NaN.
-        assert_eq!(report.answers, [58, 0, 2]);
+        assert_eq!(report.answers, Answers { policy: 58, imagined: 0, fallback: 2 });
     }
 }
 
@@ -123,7 +123,7 @@ fn imagined_rate_limited_fallback_and_late_ticks_are_replayed() {
     controller.join().unwrap();
     let report = replay(&file, &smallest_bundle());
     assert_eq!(report.first_difference, None);
-    let [observed, imagined, fallback] = report.answers;
+    let Answers { policy: observed, imagined, fallback } = report.answers;
     assert!(observed >= 2 && imagined >= 1 && fallback >= 1, "{:?}", report.answers);
     assert_eq!(report.ticks_compared, report.ticks);
 }
@@ -195,7 +195,7 @@ fn ticks_on_which_the_policy_fails_are_replayed_as_failures() {
     logged_run(bundle.path(), &file, Sampling::Sample { seed: 2 }, 12);
     let report = replay(&file, bundle.path());
     assert_eq!(report.first_difference, None);
-    assert_eq!(report.answers, [0, 0, 12]);
+    assert_eq!(report.answers, Answers { policy: 0, imagined: 0, fallback: 12 });
     assert!(report.failures >= 12);
 }
 

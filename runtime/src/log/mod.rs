@@ -21,6 +21,7 @@ mod pack;
 mod reader;
 mod record;
 mod replay;
+mod report;
 mod worker;
 
 pub use episodes::{WrittenEpisodes, write_episodes};
@@ -30,7 +31,8 @@ pub use reader::{Entry, LogReader, LoggedTick};
 pub use record::{
     BundleIdentity, Header, KEYFRAME_TICKS, LoggedCall, LoggedOutcome, Machine, Record, TickRecord,
 };
-pub use replay::{Difference, ReplayReport, Replayer};
+pub use replay::Replayer;
+pub use report::{Answers, Difference, ReplayReport};
 
 use std::path::PathBuf;
 

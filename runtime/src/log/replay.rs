@@ -7,67 +7,15 @@ use std::time::Instant;
 use rcwm_models::ACTION_LEN;
 use rcwm_models::bundle::Bundle;
 use rcwm_models::wire::ActionSource;
-use serde::Serialize;
 
 use super::LogError;
 use super::reader::{Entry, LogReader, LoggedTick};
 use super::record::{BundleIdentity, Header, LoggedCall, LoggedOutcome, TickRecord, WholeState, digest};
+use super::report::{Difference, ReplayReport};
 use crate::controller::Gate;
 use crate::engine::EngineSettings;
 use crate::policy::{CallKind, CallOutcome, Policy, State};
-use crate::telemetry::{Latency, Stage, Telemetry, table};
-
-/// Where a replay differs from the log.
-#[derive(Debug, Clone, PartialEq, Serialize)]
-pub struct Difference {
-    /// The tick, counted from 0 in the log.
-    pub tick: u64,
-    /// Sequence of the observation that was answered.
-    pub sequence: u64,
-    /// What differs.
-    pub what: String,
-    /// What the log holds.
-    pub logged: String,
-    /// What the replay gave.
-    pub replayed: String,
-}
-
-/// A replay, as printed and as written with `--json`.
-#[derive(Debug, Clone, PartialEq, Serialize)]
-pub struct ReplayReport {
-    /// The engine it was replayed on.
-    pub engine: EngineSettings,
-    /// What the run was made with.
-    pub log: Header,
-    /// The log has its proper end.
-    pub log_finished: bool,
-    /// Where the log is damaged; all before it was replayed.
-    pub log_damage: Option<String>,
-    /// Ticks replayed.
-    pub ticks: u64,
-    /// Ticks whose calls are in the log and were made again; the others follow on dropped ones.
-    pub ticks_compared: u64,
-    /// Ticks that the log says were dropped.
-    pub ticks_dropped: u64,
-    /// Answers of the policy on an observation, on an imagined state, and of the fallback.
-    pub answers: [u64; 3],
-    /// Calls made again.
-    pub calls: u64,
-    /// Work ahead that was done again because another action was executed.
-    pub recomputed: u64,
-    /// Calls on which the policy failed, as logged.
-    pub failures: u64,
-    /// Policies that took over while it ran.
-    pub swaps: u64,
-    /// Ticks that differ in anything.
-    pub ticks_differing: u64,
-    /// Largest difference of an action's component.
-    pub action_error_max: f32,
-    /// The first difference; none when all is the same bit for bit.
-    pub first_difference: Option<Difference>,
-    /// Times of the replay.
-    pub latency: Vec<Latency>,
-}
+use crate::telemetry::{Stage, Telemetry};
 
 /// Makes the calls of a log again.
 pub struct Replayer {
@@ -172,9 +120,7 @@ impl Replayer {
         let record = &tick.record;
         self.report.ticks += 1;
         self.report.ticks_dropped += record.dropped_before;
-        if let Some(count) = self.report.answers.get_mut(record.answer.source as usize) {
-            *count += 1;
-        }
+        self.report.answers.count(record.answer.source);
         if record.resumes {
             self.resume(tick);
             return;
@@ -379,69 +325,4 @@ fn load(
         return Err(LogError::OtherBundle { tried: tried.join(", "), difference });
     };
     Ok(Policy::new(bundle, engine, header.sampling)?)
-}
-
-impl ReplayReport {
-    fn new(log: Header, engine: EngineSettings) -> Self {
-        Self {
-            engine,
-            log,
-            log_finished: false,
-            log_damage: None,
-            ticks: 0,
-            ticks_compared: 0,
-            ticks_dropped: 0,
-            answers: [0; 3],
-            calls: 0,
-            recomputed: 0,
-            failures: 0,
-            swaps: 0,
-            ticks_differing: 0,
-            action_error_max: 0.0,
-            first_difference: None,
-            latency: Vec::new(),
-        }
-    }
-
-    /// The report for people.
-    #[must_use]
-    pub fn text(&self) -> String {
-        let Self {
-            ticks, ticks_compared, ticks_dropped, answers, calls, recomputed, failures, swaps, ..
-        } = self;
-        let [observed, imagined, fallback] = answers;
-        let mut text = format!(
-            "replay     {} bundle for {}, engine {}, logged on {} {}\n",
-            self.log.bundle.preset,
-            self.log.bundle.task,
-            self.engine.kind,
-            self.log.machine.architecture,
-            self.log.machine.processor
-        );
-        text += &format!(
-            "ticks      {ticks}, compared {ticks_compared}, dropped in the log {ticks_dropped}; answers: policy {observed}, imagined \
-             {imagined}, fallback {fallback}\n"
-        );
-        text += &format!(
-            "calls      {calls}, recomputed {recomputed}, failed as logged {failures}, swaps {swaps}\n"
-        );
-        if !self.log_finished && self.log_damage.is_none() {
-            text += "log        has no end: it was cut, or is still being written\n";
-        }
-        text += &match self.ticks_differing {
-            0 => format!("result     all {ticks_compared} ticks are the same, bit for bit\n"),
-            count => format!(
-                "result     {count} of {ticks_compared} ticks differ; largest difference of an action {:.3e}\n",
-                self.action_error_max
-            ),
-        };
-        text + &table(&self.latency)
-    }
-}
-
-impl std::fmt::Display for Difference {
-    fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
-        let Self { tick, sequence, what, logged, replayed } = self;
-        write!(f, "tick {tick} (observation {sequence}): {what}: logged {logged}, replayed {replayed}")
-    }
 }

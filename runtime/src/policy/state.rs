@@ -5,7 +5,7 @@ use rcwm_models::bundle::InitialState;
 use super::Buffers;
 
 /// State of one branch.
-#[derive(Debug, Clone, PartialEq, Default)]
+#[derive(Debug, PartialEq, Default)]
 pub struct BranchState {
     /// Posterior z: n class indices.
     pub z: Vec<i64>,
@@ -14,12 +14,35 @@ pub struct BranchState {
 }
 
 /// State of both branches.
-#[derive(Debug, Clone, PartialEq, Default)]
+#[derive(Debug, PartialEq, Default)]
 pub struct State {
     /// Robot branch.
     pub robot: BranchState,
     /// Environment branch.
     pub environment: BranchState,
+}
+
+// Written out because the derived `clone_from` allocates anew.
+impl Clone for BranchState {
+    fn clone(&self) -> Self {
+        Self { z: self.z.clone(), h: self.h.clone() }
+    }
+
+    fn clone_from(&mut self, source: &Self) {
+        self.z.clone_from(&source.z);
+        self.h.clone_from(&source.h);
+    }
+}
+
+impl Clone for State {
+    fn clone(&self) -> Self {
+        Self { robot: self.robot.clone(), environment: self.environment.clone() }
+    }
+
+    fn clone_from(&mut self, source: &Self) {
+        self.robot.clone_from(&source.robot);
+        self.environment.clone_from(&source.environment);
+    }
 }
 
 impl From<&InitialState> for State {
