@@ -17,6 +17,8 @@ const ON_THE_WAY_NS: u64 = 1_000_000;
 /// An observation, without its image.
 #[derive(Debug, Clone, Copy)]
 pub struct Published {
+    /// Who published it.
+    pub publisher: u128,
     /// Its sequence.
     pub sequence: u64,
     /// When it was due.
@@ -109,10 +111,10 @@ fn look(observations: &ObserverLink, actions: &ActionObserverLink, record: &Mute
     let action = actions.poll_action().expect("the link works");
     let mut record = record.lock().unwrap_or_else(PoisonError::into_inner);
     if let Wait::Message(observation) = observed {
-        let (sequence, scheduled_ns) = (observation.sequence, observation.scheduled_ns);
         record.observations.push(Published {
-            sequence,
-            scheduled_ns,
+            publisher: observation.origin().value(),
+            sequence: observation.sequence,
+            scheduled_ns: observation.scheduled_ns,
             published_ns: observation.published_ns,
         });
     }
@@ -160,13 +162,16 @@ impl Record {
         verdict
     }
 
-    /// Sequences since the last start of a simulator count; one that was delayed is smaller than the newest.
+    /// Compares with what the same simulator had published: the first observations of the next one may have escaped the witness.
     fn stale(&self, action: &Action) -> Option<Stale> {
         let before = |time_ns: u64| self.observations.partition_point(|seen| seen.published_ns <= time_ns);
-        let seen = &self.observations[..before(action.published_ns)];
-        let start = seen.iter().rposition(|seen| seen.sequence == 0).unwrap_or(0);
-        let known = before(action.published_ns.saturating_sub(ON_THE_WAY_NS)).max(start);
-        let newest = self.observations[start..known].iter().max_by_key(|seen| seen.sequence)?;
+        let publisher = match self.observations.get(before(action.published_ns)) {
+            Some(next) => next.publisher,
+            None => self.observations.last()?.publisher,
+        };
+        let known = &self.observations[..before(action.published_ns.saturating_sub(ON_THE_WAY_NS))];
+        let own = known.iter().filter(|seen| seen.publisher == publisher);
+        let newest = own.max_by_key(|seen| seen.sequence)?;
         (action.answers < newest.sequence).then(|| Stale {
             answers: action.answers,
             newest: newest.sequence,
