@@ -13,7 +13,8 @@ use rcwm_runtime::controller::{Cause, ControllerError, Ended, Fallback, State, S
 use rcwm_runtime::{EngineSettings, Policy};
 use support::{ask, dividing_by_zero, image, observation, own_link, smallest_bundle, start_controller_with};
 
-const PERIOD_NS: u64 = 50_000_000;
+/// Long enough for a busy machine to read each answer before the next.
+const PERIOD_NS: u64 = 200_000_000;
 /// Far longer than anything here takes.
 const NEVER: Duration = Duration::from_secs(20);
 

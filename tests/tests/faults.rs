@@ -13,7 +13,7 @@ const ROUNDS: usize = 2;
 /// Runs an experiment; nothing stale or unfit was on the wire, and nothing is left.
 fn sound(experiment: Experiment, rounds: usize) -> Outcome {
     let outcome = experiment.run(rounds, PERIOD);
-    assert_eq!((outcome.verdict.unfit, outcome.verdict.stale), (0, 0), "{outcome:?}");
+    assert!(outcome.verdict.unfit == 0 && outcome.verdict.stale.is_empty(), "{outcome:?}");
     assert_eq!(outcome.leftovers, Vec::<String>::new());
     assert_eq!(outcome.rounds, rounds);
     outcome
@@ -166,8 +166,6 @@ fn observations_that_are_lost_or_come_periods_late_are_imagined() {
     for experiment in [Experiment::Dropped, Experiment::Delayed] {
         let outcome = sound(experiment, 1);
         assert!(count(&outcome, "imagined_answers") >= 1, "{outcome:?}");
-        let stale = if experiment == Experiment::Delayed { 1 } else { 0 };
-        assert_eq!(count(&outcome, "stale_observations"), stale, "{outcome:?}");
     }
 }
 

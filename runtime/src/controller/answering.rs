@@ -68,6 +68,9 @@ impl Controller {
             self.state = step(self.state, Event::Decided, self.settings.ticks).0;
         }
         self.pacing.observed(observation);
+        if self.is_overtaken(observation)? {
+            return Ok(Taken::Again);
+        }
         let answer = self.send(sequence, source, own.action)?;
         if went_on {
             self.work_ahead((!observation.is(ObservationFlags::LAST)).then_some(&answer.action));
@@ -94,16 +97,7 @@ impl Controller {
         let (source, action) = self.respond(event, decision.as_ref())?;
         self.pacing.observed(observation);
         let overtaken = self.is_overtaken(observation)?;
-        let answer = match overtaken {
-            false => self.send(observation.sequence, source, action)?,
-            true => Action {
-                answers: observation.sequence,
-                published_ns: 0,
-                source: source as u32,
-                reserved: 0,
-                action,
-            },
-        };
+        let answer = self.send_unless(overtaken, observation.sequence, source, action)?;
         self.own_answer = (!overtaken).then_some(answer);
         let times = TickTimes {
             scheduled_ns: observation.scheduled_ns,
@@ -222,7 +216,10 @@ impl Controller {
                 return Ok(());
             }
         };
-        let answer = self.send(missing.sequence, source, action)?;
+        // Whatever has come by now is worth more than an answer without it.
+        self.newer = self.link.poll_observation()?;
+        let overtaken = self.newer.is_some();
+        let answer = self.send_unless(overtaken, missing.sequence, source, action)?;
         let times = TickTimes {
             scheduled_ns: missing.scheduled_ns,
             published_ns: 0,
@@ -237,12 +234,14 @@ impl Controller {
                 rewound: false,
                 decision,
                 answer,
-                overtaken: false,
+                overtaken,
                 times,
             },
             observers,
         );
-        self.work_ahead(Some(&answer.action));
+        if !overtaken {
+            self.work_ahead(Some(&answer.action));
+        }
         Ok(())
     }
 
@@ -277,9 +276,22 @@ impl Controller {
             return Ok(false);
         }
         self.newer = self.link.poll_observation()?;
-        let overtaken = self.newer.as_ref().is_some_and(|newer| newer.sequence != observation.sequence);
-        self.counters.overtaken_answers += u64::from(overtaken);
-        Ok(overtaken)
+        Ok(self.newer.as_ref().is_some_and(|newer| newer.sequence != observation.sequence))
+    }
+
+    /// Sends, or counts that a newer observation has made the answer stale.
+    fn send_unless(
+        &mut self,
+        overtaken: bool,
+        sequence: u64,
+        source: ActionSource,
+        action: [f32; ACTION_LEN],
+    ) -> Result<Action, ControllerError> {
+        if !overtaken {
+            return self.send(sequence, source, action);
+        }
+        self.counters.overtaken_answers += 1;
+        Ok(Action { answers: sequence, published_ns: 0, source: source as u32, reserved: 0, action })
     }
 
     /// The only way onto the wire.

@@ -57,8 +57,11 @@ impl Controller {
     }
 
     pub(super) fn record_missing(&mut self, missing: &Missing, times: &TickTimes) {
-        self.telemetry.record(Stage::Imagine, times.sent_ns.saturating_sub(times.received_ns));
-        self.telemetry.record(Stage::FromSchedule, times.sent_ns.saturating_sub(times.scheduled_ns));
         self.counters.skipped_ticks += missing.skipped;
+        // Where it was not sent, the observation that came instead tells.
+        if times.sent_ns > 0 {
+            self.telemetry.record(Stage::Imagine, times.sent_ns.saturating_sub(times.received_ns));
+            self.telemetry.record(Stage::FromSchedule, times.sent_ns.saturating_sub(times.scheduled_ns));
+        }
     }
 }

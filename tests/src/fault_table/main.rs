@@ -14,7 +14,7 @@ use serde::Serialize;
 #[derive(Debug, Parser)]
 #[command(
     name = "fault-table",
-    after_help = "Examples:\n  cargo build --release --workspace --bins\n  target/release/fault-table --rounds 50 --json faults.json"
+    after_help = "Examples:\n  cargo build --release --workspace --bins\n  target/release/fault-table --rounds 50 --json faults.json\n  target/release/fault-table --only dropped --only delayed"
 )]
 struct Arguments {
     #[command(subcommand)]
@@ -25,6 +25,9 @@ struct Arguments {
     /// Rate of the recorded stream, in Hz
     #[arg(long, value_name = "HZ", default_value_t = 40, value_parser = clap::value_parser!(u32).range(1..=1000))]
     rate_hz: u32,
+    /// Only these faults, by their names in the table
+    #[arg(long, value_name = "FAULT")]
+    only: Vec<String>,
     /// Writes everything that was measured to this file as JSON
     #[arg(long, value_name = "FILE")]
     json: Option<PathBuf>,
@@ -56,10 +59,16 @@ fn main() -> anyhow::Result<()> {
         return Ok(());
     }
     let period = Duration::from_secs(1) / arguments.rate_hz;
-    let bar = indicatif::ProgressBar::new(Experiment::ALL.len() as u64);
+    let wanted = |fault: &Experiment| arguments.only.is_empty() || arguments.only.contains(&name(*fault));
+    let experiments: Vec<Experiment> = Experiment::ALL.into_iter().filter(wanted).collect();
+    if experiments.is_empty() {
+        let names = Experiment::ALL.map(name).join(", ");
+        anyhow::bail!("--only {}: no such fault; there are {names}", arguments.only.join(" --only "));
+    }
+    let bar = indicatif::ProgressBar::new(experiments.len() as u64);
     println!("{HEADER}");
     let mut outcomes = Vec::new();
-    for experiment in Experiment::ALL {
+    for experiment in experiments {
         let outcome = experiment.run(arguments.rounds, period);
         bar.suspend(|| println!("{}", row(&outcome)));
         bar.inc(1);
@@ -78,12 +87,17 @@ const HEADER: &str = "\
 | fault | times | stand-in after, periods | fallback after, periods | policy back after, ms | actions | imagined | fallback | stale | unfit | left |
 | --- | --- | --- | --- | --- | --- | --- | --- | --- | --- | --- |";
 
+/// The name in the table and on the command line.
+fn name(experiment: Experiment) -> String {
+    let name = serde_json::to_value(experiment).ok();
+    name.as_ref().and_then(|name| name.as_str()).unwrap_or("?").replace('_', "-")
+}
+
 fn row(outcome: &Outcome) -> String {
-    let name = serde_json::to_value(outcome.experiment).ok();
-    let name = name.as_ref().and_then(|name| name.as_str()).unwrap_or("?").replace('_', " ");
     let verdict = &outcome.verdict;
     format!(
-        "| {name} | {} | {} | {} | {} | {} | {} | {} | {} | {} | {} |",
+        "| {} | {} | {} | {} | {} | {} | {} | {} | {} | {} | {} |",
+        name(outcome.experiment),
         outcome.rounds,
         spread(&outcome.stand_in_periods),
         spread(&outcome.fallback_periods),
@@ -91,7 +105,7 @@ fn row(outcome: &Outcome) -> String {
         verdict.actions,
         verdict.sources[1],
         verdict.sources[2],
-        verdict.stale,
+        verdict.stale.len(),
         verdict.unfit,
         outcome.leftovers.len(),
     )

@@ -13,4 +13,4 @@ pub use bed::{Bed, ControllerOptions};
 pub use experiments::{Experiment, Outcome};
 pub use peer::{Fault, Served, serve};
 pub use poison::poisoned_bundle;
-pub use witness::{Published, Record, Verdict, Witness};
+pub use witness::{Published, Record, Stale, Verdict, Witness};

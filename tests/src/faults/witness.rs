@@ -17,6 +17,8 @@ const ON_THE_WAY_NS: u64 = 1_000_000;
 /// An observation, without its image.
 #[derive(Debug, Clone, Copy)]
 pub struct Published {
+    /// Who published it.
+    pub publisher: u128,
     /// Its sequence.
     pub sequence: u64,
     /// When it was due.
@@ -109,18 +111,31 @@ fn look(observations: &ObserverLink, actions: &ActionObserverLink, record: &Mute
     let action = actions.poll_action().expect("the link works");
     let mut record = record.lock().unwrap_or_else(PoisonError::into_inner);
     if let Wait::Message(observation) = observed {
-        let (sequence, scheduled_ns) = (observation.sequence, observation.scheduled_ns);
         record.observations.push(Published {
-            sequence,
-            scheduled_ns,
+            publisher: observation.origin().value(),
+            sequence: observation.sequence,
+            scheduled_ns: observation.scheduled_ns,
             published_ns: observation.published_ns,
         });
     }
     record.actions.extend(action);
 }
 
+/// An action that came too late.
+#[derive(Debug, Clone, PartialEq, Eq, serde::Serialize)]
+pub struct Stale {
+    /// What it answers.
+    pub answers: u64,
+    /// The newest observation by then.
+    pub newest: u64,
+    /// Its source.
+    pub source: u32,
+    /// How long after the newest it was published, in us.
+    pub after_us: u64,
+}
+
 /// What was found on the wire that must not be there.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, Default, serde::Serialize)]
+#[derive(Debug, Clone, PartialEq, Eq, Default, serde::Serialize)]
 pub struct Verdict {
     /// Actions seen.
     pub actions: usize,
@@ -128,8 +143,8 @@ pub struct Verdict {
     pub sources: [usize; 3],
     /// Actions with a value that is not finite or not within [-1, 1].
     pub unfit: usize,
-    /// Actions that answer an observation although a newer one had been published.
-    pub stale: usize,
+    /// Actions that answer an observation although a newer one had been published for a millisecond.
+    pub stale: Vec<Stale>,
 }
 
 impl Record {
@@ -139,7 +154,7 @@ impl Record {
         let mut verdict = Verdict { actions: self.actions.len(), ..Verdict::default() };
         for action in &self.actions {
             verdict.unfit += usize::from(!action.action.iter().all(|x| (-1.0..=1.0).contains(x)));
-            verdict.stale += usize::from(self.is_stale(action));
+            verdict.stale.extend(self.stale(action));
             if let Some(source) = ActionSource::from_wire(action.source) {
                 verdict.sources[source as usize] += 1;
             }
@@ -147,13 +162,21 @@ impl Record {
         verdict
     }
 
-    /// Sequences since the last start of a simulator count; one that was delayed is smaller than the newest.
-    fn is_stale(&self, action: &Action) -> bool {
+    /// Compares with what the same simulator had published: the first observations of the next one may have escaped the witness.
+    fn stale(&self, action: &Action) -> Option<Stale> {
         let before = |time_ns: u64| self.observations.partition_point(|seen| seen.published_ns <= time_ns);
-        let seen = &self.observations[..before(action.published_ns)];
-        let start = seen.iter().rposition(|seen| seen.sequence == 0).unwrap_or(0);
-        let known = before(action.published_ns.saturating_sub(ON_THE_WAY_NS)).max(start);
-        let newest = self.observations[start..known].iter().map(|seen| seen.sequence).max();
-        newest.is_some_and(|newest| action.answers < newest)
+        let publisher = match self.observations.get(before(action.published_ns)) {
+            Some(next) => next.publisher,
+            None => self.observations.last()?.publisher,
+        };
+        let known = &self.observations[..before(action.published_ns.saturating_sub(ON_THE_WAY_NS))];
+        let own = known.iter().filter(|seen| seen.publisher == publisher);
+        let newest = own.max_by_key(|seen| seen.sequence)?;
+        (action.answers < newest.sequence).then(|| Stale {
+            answers: action.answers,
+            newest: newest.sequence,
+            source: action.source,
+            after_us: (action.published_ns - newest.published_ns) / 1000,
+        })
     }
 }
