@@ -9,6 +9,8 @@ use std::sync::atomic::{AtomicBool, AtomicU64, AtomicUsize, Ordering};
 use std::thread::{JoinHandle, Thread};
 use std::time::{Duration, Instant};
 
+/// Name of the helper's thread, as the system shows it.
+pub const HELPER_NAME: &str = "rcwm-tick";
 /// Most chunks of a piece of work.
 const CHUNKS_MAX: usize = 0xffff;
 /// Bits of the ticket that hold the next chunk, and the number of chunks.
@@ -109,7 +111,7 @@ impl Team {
     /// What the operating system says.
     pub fn start(spin: Duration) -> std::io::Result<Self> {
         let shared = Arc::new(Shared::default());
-        let helper = std::thread::Builder::new().name("rcwm-tick".into()).spawn({
+        let helper = std::thread::Builder::new().name(HELPER_NAME.into()).spawn({
             let shared = Arc::clone(&shared);
             move || shared.help(spin)
         })?;

@@ -2,7 +2,7 @@
 //! else at the speed that as many bytes as a whole tick reads are read again and again, one after the other.
 
 use std::hint::black_box;
-use std::time::Instant;
+use std::time::{Duration, Instant};
 
 use prost::Message;
 use rcwm_models::onnx::{Graph, Model, Node, OperatorSet, Tensor as OnnxTensor, ValueInfo, data_type};
@@ -21,11 +21,52 @@ const READ_BYTES_MIN: u64 = 1 << 20;
 /// Repetitions; the best one counts, for the limit is what the machine can do undisturbed.
 const REPETITIONS: usize = 12;
 
+/// How long the clock is watched for stalls.
+const WATCHED: Duration = Duration::from_secs(1);
+/// What counts as a stall: two looks at the clock this far apart, in ns. Undisturbed they are some tens of ns apart.
+const STALL_NS_MIN: u64 = 20_000;
+
 /// Measured peaks of one core.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct Machine {
     gemm_gflops: f64,
     read_gb_per_s: f64,
+}
+
+/// How often the machine stops a thread that does nothing but look at the clock: what no program can be better than.
+#[derive(Debug, Clone, Copy, PartialEq, Serialize)]
+pub struct Stalls {
+    /// Stalls of more than 20 us in a second.
+    pub per_s: f64,
+    /// Share of the time that is lost in them.
+    pub share: f64,
+    /// The median one; 0 where there is none.
+    pub p50_us: f64,
+    /// The longest.
+    pub max_us: f64,
+}
+
+/// Watches the clock for a second.
+#[must_use]
+pub fn measure_stalls() -> Stalls {
+    let mut gaps_ns = Vec::with_capacity(1 << 16);
+    let start = Instant::now();
+    let mut last_ns = 0;
+    while last_ns < WATCHED.as_nanos() as u64 {
+        let now_ns = start.elapsed().as_nanos() as u64;
+        if now_ns - last_ns > STALL_NS_MIN && gaps_ns.len() < gaps_ns.capacity() {
+            gaps_ns.push(now_ns - last_ns);
+        }
+        last_ns = now_ns;
+    }
+    gaps_ns.sort_unstable();
+    let (seconds, us) = (last_ns as f64 / 1e9, |gap_ns: &u64| *gap_ns as f64 / 1e3);
+    Stalls {
+        per_s: gaps_ns.len() as f64 / seconds,
+        share: gaps_ns.iter().sum::<u64>() as f64 / last_ns as f64,
+        p50_us: gaps_ns.get(gaps_ns.len() / 2).map_or(0.0, us),
+        max_us: gaps_ns.last().map_or(0.0, us),
+    }
 }
 
 /// Peaks of one core, and the shortest time between image and action with them.

@@ -8,7 +8,7 @@ mod limit;
 mod report;
 
 pub use ladder::{Case, engines, ladder};
-pub use limit::{Limit, Machine, measure_machine};
+pub use limit::{Limit, Machine, Stalls, measure_machine, measure_stalls};
 pub use report::{BenchReport, CaseBench, Step};
 
 use std::time::Instant;
@@ -20,6 +20,7 @@ use rcwm_models::tensors::TensorsError;
 use crate::compile::{CompileError, Optimizations, compile};
 use crate::inspect::{Cost, CostError, InspectError, inspect};
 use crate::policy::{Policy, PolicyError, Sampling};
+use crate::realtime;
 use crate::telemetry::{Curve, LatencyFiles, PlotError, Stage, Telemetry, plot};
 
 /// Why nothing could be measured.
@@ -52,7 +53,8 @@ struct Runner {
     executed: Option<[f32; ACTION_LEN]>,
 }
 
-/// Runs every case for `ticks` ticks after a tenth of them unmeasured. `go_on` is asked after every round.
+/// Runs every case for `ticks` ticks after a tenth of them unmeasured. With `real_time`, the calling thread and the ticks' second
+/// threads get a fixed priority and the process locked memory, as far as the system grants it. `go_on` is asked after every round.
 ///
 /// # Errors
 /// See [`BenchError`].
@@ -60,6 +62,7 @@ pub fn bench(
     bundle: &Bundle,
     cases: &[Case],
     ticks: usize,
+    real_time: Option<realtime::Request>,
     go_on: &mut dyn FnMut() -> bool,
 ) -> Result<Measured, BenchError> {
     let machine = measure_machine(inspect(bundle)?.tick.weight_bytes)?;
@@ -71,6 +74,8 @@ pub fn bench(
             Ok(Runner { case: *case, policy, telemetry: Telemetry::new(), executed: None })
         })
         .collect::<Result<Vec<_>, PolicyError>>()?;
+    let granted = real_time.and_then(realtime::ask);
+    let stalls = measure_stalls();
     let images = bundle.golden.u8("input/image")?;
     let count = images.shape().first().copied().unwrap_or(0);
     let images = images.as_slice().filter(|_| count > 0);
@@ -78,6 +83,7 @@ pub fn bench(
     let image_len = images.len() / count;
     let warm_up = ticks / 10;
     let mut measured = 0;
+    let mut rested = Instant::now();
     for round in 0..warm_up + ticks {
         let image = &images[round % count * image_len..][..image_len];
         for turn in 0..runners.len() {
@@ -85,13 +91,27 @@ pub fn bench(
             runners[index].tick(image, round % count == 0, round >= warm_up)?;
         }
         measured += usize::from(round >= warm_up);
+        if granted.is_some() {
+            // As a controller rests between its ticks; a thread of a fixed priority that never does is stopped for some time.
+            std::thread::sleep(rested.elapsed() / 8);
+            rested = Instant::now();
+        }
         if !go_on() {
             break;
         }
     }
     let runs: Vec<(Case, Telemetry)> =
         runners.into_iter().map(|runner| (runner.case, runner.telemetry)).collect();
-    Ok(Measured { report: BenchReport::new(bundle, measured, limit, &runs), runs })
+    Ok(Measured {
+        report: BenchReport::new(bundle, measured, limit, Conditions { stalls, granted }, &runs),
+        runs,
+    })
+}
+
+/// Under which conditions was measured.
+pub(crate) struct Conditions {
+    stalls: Stalls,
+    granted: Option<realtime::Granted>,
 }
 
 /// What was measured: the report, and every time behind it.
@@ -155,11 +175,7 @@ impl Runner {
         if measured {
             self.telemetry.record(Stage::Tick, tick_ns);
             self.telemetry.record(Stage::Ahead, ahead_ns);
-            for (stage, time_ns) in Stage::POLICY.into_iter().zip(decision.stage_ns) {
-                if time_ns > 0 {
-                    self.telemetry.record(stage, time_ns);
-                }
-            }
+            self.telemetry.record_policy(&decision.stage_ns);
         }
         Ok(())
     }

@@ -4,8 +4,9 @@ use rcwm_models::bundle::Bundle;
 use serde::Serialize;
 
 use super::ladder::{SINGLE, YARDSTICK};
-use super::{Case, Limit};
+use super::{Case, Conditions, Limit, Stalls};
 use crate::engine::EngineSettings;
+use crate::realtime::Granted;
 use crate::telemetry::{Latency, Stage, Telemetry, table};
 
 /// Latencies of one case.
@@ -51,12 +52,22 @@ pub struct BenchReport {
     pub p999_over_p50: Option<f64>,
     /// The limit of one thread.
     pub limit: Limit,
+    /// What the machine takes from any thread.
+    pub stalls: Stalls,
+    /// What the system granted, where it was asked for real time.
+    pub realtime: Option<Granted>,
     /// Every case.
     pub engines: Vec<CaseBench>,
 }
 
 impl BenchReport {
-    pub(super) fn new(bundle: &Bundle, ticks: usize, limit: Limit, runs: &[(Case, Telemetry)]) -> Self {
+    pub(super) fn new(
+        bundle: &Bundle,
+        ticks: usize,
+        limit: Limit,
+        conditions: Conditions,
+        runs: &[(Case, Telemetry)],
+    ) -> Self {
         let engines: Vec<CaseBench> = runs
             .iter()
             .map(|(case, telemetry)| CaseBench {
@@ -77,6 +88,8 @@ impl BenchReport {
             share_of_limit_single_thread: single.map(|bench| bench.share_of_limit),
             p999_over_p50: deployed.and_then(CaseBench::tick).map(|tick| tick.p999_us / tick.p50_us),
             limit,
+            stalls: conditions.stalls,
+            realtime: conditions.granted,
             engines,
         }
     }
@@ -92,6 +105,15 @@ impl BenchReport {
              {weights_us:.1}\n",
             self.preset, self.ticks
         );
+        let Stalls { per_s, share, p50_us, max_us } = self.stalls;
+        text += &format!(
+            "stalls     a thread that only looks at the clock is stopped {per_s:.0} times a second for {p50_us:.0} us (median; at most \
+             {max_us:.0}), {:.1} % of the time\n",
+            100.0 * share
+        );
+        for line in self.realtime.iter().flat_map(Granted::lines) {
+            text += &format!("realtime   {line}\n");
+        }
         for bench in &self.engines {
             let threads = bench.case.settings.threads;
             text += &format!("{:<10} {threads} thread(s)\n", bench.case.name);

@@ -6,6 +6,7 @@ use std::sync::atomic::Ordering;
 use clap::Args;
 
 use super::EngineChoice;
+use crate::realtime::Request;
 use crate::telemetry::LatencyFiles;
 
 /// Arguments of `bench`.
@@ -26,6 +27,10 @@ pub(super) struct BenchArguments {
     /// Measures tract from the exported parts to what is deployed, one optimisation at a time, in place of the engines
     #[arg(long)]
     ladder: bool,
+    /// Measures with SCHED_FIFO of this priority and locked memory, as `run --realtime` does
+    #[arg(long, value_name = "PRIORITY", num_args = 0..=1, default_missing_value = "50",
+        value_parser = clap::value_parser!(u8).range(1..=99))]
+    realtime: Option<u8>,
     #[command(flatten)]
     files: LatencyFiles,
     /// Writes everything to this file as JSON
@@ -42,9 +47,10 @@ pub(super) fn run(arguments: &BenchArguments) -> anyhow::Result<()> {
     }
     let stop = super::stop_flag()?;
     let ticks = arguments.ticks as usize;
+    let real_time = arguments.realtime.map(|priority| Request { priority: Some(priority), cpu: None });
     let bar = super::progress_bar(ticks + ticks / 10, "measuring");
     let mut rounds: u64 = 0;
-    let measured = crate::bench::bench(&bundle, &cases, ticks, &mut || {
+    let measured = crate::bench::bench(&bundle, &cases, ticks, real_time, &mut || {
         rounds += 1;
         // Drawing costs time that would disturb the next tick.
         if rounds.is_multiple_of(50) {

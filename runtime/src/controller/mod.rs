@@ -252,6 +252,9 @@ impl Controller {
             }
             Plan::Wait { spin, timeout } => {
                 self.looked = false;
+                if spin > Duration::ZERO {
+                    self.policy.expect_image();
+                }
                 self.link.wait_observation_polling(spin, timeout.min(WAIT_SLICE))
             }
         };

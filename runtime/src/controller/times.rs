@@ -23,9 +23,7 @@ impl Controller {
     }
 
     pub(super) fn record_stages(&mut self, decision: &Decision) {
-        for (stage, time_ns) in Stage::POLICY.into_iter().zip(decision.stage_ns) {
-            self.telemetry.record(stage, time_ns);
-        }
+        self.telemetry.record_policy(&decision.stage_ns);
     }
 
     pub(super) fn record_times(&mut self, observation: &Observation, times: &TickTimes, unanswered: u64) {

@@ -75,11 +75,7 @@ impl LoggedLatencies {
         self.report.ticks_dropped += record.dropped_before;
         for call in &record.calls {
             match &call.outcome {
-                LoggedOutcome::Decided { stage_ns, .. } => {
-                    for (stage, time_ns) in Stage::POLICY.into_iter().zip(stage_ns) {
-                        self.telemetry.record(stage, *time_ns);
-                    }
-                }
+                LoggedOutcome::Decided { stage_ns, .. } => self.telemetry.record_policy(stage_ns),
                 LoggedOutcome::Done(time_ns) => self.telemetry.record(Stage::Ahead, *time_ns),
                 _ => {}
             }

@@ -204,9 +204,7 @@ impl Replayer {
         match &outcome {
             CallOutcome::Decided { recomputed, stage_ns, .. } => {
                 self.report.recomputed += u64::from(*recomputed);
-                for (stage, time_ns) in Stage::POLICY.into_iter().zip(stage_ns) {
-                    self.telemetry.record(stage, *time_ns);
-                }
+                self.telemetry.record_policy(stage_ns);
             }
             CallOutcome::Done { time_ns } => self.telemetry.record(Stage::Ahead, *time_ns),
             _ => {}

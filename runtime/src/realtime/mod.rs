@@ -9,6 +9,8 @@ use rustix::process::Pid;
 use rustix::thread::{CpuSet, sched_getaffinity, sched_setaffinity};
 use serde::Serialize;
 
+use crate::team::HELPER_NAME;
+
 /// What to ask for.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
 pub struct Request {
@@ -36,6 +38,8 @@ pub struct Granted {
     pub grants: Vec<Grant>,
     /// Whether the kernel says that it is a PREEMPT_RT one.
     pub kernel_preempt_rt: bool,
+    /// Share of the time for which the kernel stops real-time threads that never rest; none where it does not.
+    pub throttled_share: Option<f64>,
 }
 
 impl Granted {
@@ -54,11 +58,18 @@ impl Granted {
             true => "kernel: PREEMPT_RT",
             false => "kernel: not PREEMPT_RT, so that the longest delay is not bounded",
         };
-        grants.chain([kernel.to_owned()])
+        let throttled = self.throttled_share.map(|share| {
+            format!(
+                "kernel: stops real-time threads that never rest for {:.0} % of the time (sched_rt_runtime_us): let the loop \
+                 spin for less than its period",
+                100.0 * share
+            )
+        });
+        grants.chain([kernel.to_owned()]).chain(throttled)
     }
 }
 
-/// Asks for it, for the calling thread (priority, core) and for the process (memory); none where nothing is asked for.
+/// Asks for it, for the calling thread (priority, core), the second threads of ticks (priority) and the process (memory); none where nothing is asked for.
 #[must_use]
 pub fn ask(request: Request) -> Option<Granted> {
     if request == Request::default() {
@@ -66,14 +77,29 @@ pub fn ask(request: Request) -> Option<Granted> {
     }
     let mut grants = Vec::new();
     if let Some(priority) = request.priority {
-        grants.push(fixed_priority(priority));
+        grants.push(fixed_priority(priority, THIS_THREAD, "the loop's thread"));
+        for helper in helpers() {
+            grants.push(fixed_priority(priority, helper, "the tick's second thread"));
+        }
         grants.push(locked_memory());
     }
     if let Some(cpu) = request.cpu {
         grants.push(one_core(cpu));
     }
     let kernel = std::fs::read_to_string("/sys/kernel/realtime");
-    Some(Granted { grants, kernel_preempt_rt: kernel.is_ok_and(|text| text.trim() == "1") })
+    let kernel_preempt_rt = kernel.is_ok_and(|text| text.trim() == "1");
+    let throttled_share = request.priority.and_then(|_| throttled_share());
+    Some(Granted { grants, kernel_preempt_rt, throttled_share })
+}
+
+/// What the kernel keeps from real-time threads.
+fn throttled_share() -> Option<f64> {
+    let read = |name: &str| -> Option<f64> {
+        std::fs::read_to_string(format!("/proc/sys/kernel/{name}")).ok()?.trim().parse().ok()
+    };
+    let (runtime, period) = (read("sched_rt_runtime_us")?, read("sched_rt_period_us")?);
+    // -1 means all of it.
+    (runtime >= 0.0 && runtime < period).then(|| 1.0 - runtime / period)
 }
 
 fn grant(what: String, result: Result<String, String>) -> Grant {
@@ -81,31 +107,46 @@ fn grant(what: String, result: Result<String, String>) -> Grant {
     Grant { what, granted, detail: result.unwrap_or_else(|reason| reason) }
 }
 
-fn fixed_priority(priority: u8) -> Grant {
-    let what = format!("SCHED_FIFO priority {priority}");
-    grant(what, set_fixed_priority(priority).and_then(|()| read_fixed_priority(priority)))
+/// Number of the calling thread in the scheduler's calls.
+const THIS_THREAD: i32 = 0;
+
+/// Second threads of the ticks of this process.
+fn helpers() -> Vec<i32> {
+    let entries = std::fs::read_dir("/proc/self/task").into_iter().flatten().flatten();
+    let is_helper = |entry: &std::fs::DirEntry| {
+        std::fs::read_to_string(entry.path().join("comm")).is_ok_and(|name| name.trim_end() == HELPER_NAME)
+    };
+    entries.filter(is_helper).filter_map(|entry| entry.file_name().to_str()?.parse().ok()).collect()
 }
 
-fn set_fixed_priority(priority: u8) -> Result<(), String> {
+fn fixed_priority(priority: u8, thread: i32, whose: &str) -> Grant {
+    let what = format!("SCHED_FIFO priority {priority}");
+    grant(
+        what,
+        set_fixed_priority(priority, thread).and_then(|()| read_fixed_priority(priority, thread, whose)),
+    )
+}
+
+fn set_fixed_priority(priority: u8, thread: i32) -> Result<(), String> {
     let param = libc::sched_param { sched_priority: i32::from(priority) };
     // Threads that this one starts later are ordinary ones again.
     let policy = libc::SCHED_FIFO | libc::SCHED_RESET_ON_FORK;
-    // SAFETY: 0 is the calling thread, and `param` lives through the call.
-    match unsafe { libc::sched_setscheduler(0, policy, &raw const param) } {
+    // SAFETY: `param` lives through the call.
+    match unsafe { libc::sched_setscheduler(thread, policy, &raw const param) } {
         0 => Ok(()),
         _ => Err(format!("{}; run as root, give CAP_SYS_NICE, or raise `ulimit -r`", Error::last_os_error())),
     }
 }
 
-fn read_fixed_priority(expected: u8) -> Result<String, String> {
+fn read_fixed_priority(expected: u8, thread: i32, whose: &str) -> Result<String, String> {
     let mut param = libc::sched_param { sched_priority: 0 };
-    // SAFETY: 0 is the calling thread.
-    let policy = unsafe { libc::sched_getscheduler(0) };
-    // SAFETY: 0 is the calling thread, and `param` lives through the call.
-    let read = unsafe { libc::sched_getparam(0, &raw mut param) };
+    // SAFETY: it only asks.
+    let policy = unsafe { libc::sched_getscheduler(thread) };
+    // SAFETY: `param` lives through the call.
+    let read = unsafe { libc::sched_getparam(thread, &raw mut param) };
     let found = param.sched_priority;
     if read == 0 && policy & !libc::SCHED_RESET_ON_FORK == libc::SCHED_FIFO && found == i32::from(expected) {
-        Ok(format!("the loop's thread runs with SCHED_FIFO, priority {found}"))
+        Ok(format!("{whose} runs with SCHED_FIFO, priority {found}"))
     } else {
         Err(format!("the system says policy {policy}, priority {found}"))
     }
@@ -176,7 +217,7 @@ mod tests {
 
     #[test]
     fn a_priority_that_does_not_exist_is_refused_with_a_reason() {
-        let refused = grant("priority".into(), set_fixed_priority(200).map(|()| String::new()));
+        let refused = grant("priority".into(), set_fixed_priority(200, THIS_THREAD).map(|()| String::new()));
         assert!(!refused.granted && refused.detail.contains("CAP_SYS_NICE"), "{refused:?}");
     }
 
@@ -186,10 +227,15 @@ mod tests {
             Grant { what: "core 1".into(), granted: true, detail: "kept".into() },
             Grant { what: "SCHED_FIFO priority 50".into(), granted: false, detail: "not permitted".into() },
         ];
-        let granted = Granted { grants, kernel_preempt_rt: false };
+        let granted = Granted { grants, kernel_preempt_rt: false, throttled_share: Some(0.05) };
         let lines: Vec<_> = granted.lines().collect();
         assert_eq!(lines[0], "core 1: granted: kept");
         assert_eq!(lines[1], "SCHED_FIFO priority 50: refused: not permitted");
-        assert!(lines[2].contains("not PREEMPT_RT") && lines.len() == 3 && !granted.all());
+        assert!(
+            lines[2].contains("not PREEMPT_RT")
+                && lines[3].contains("for 5 %")
+                && lines.len() == 4
+                && !granted.all()
+        );
     }
 }

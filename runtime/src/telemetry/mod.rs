@@ -145,6 +145,13 @@ impl Telemetry {
         self.recent.since(first)
     }
 
+    /// Records the stages of the policy; what was worked ahead took no time in the tick, and is left out.
+    pub fn record_policy(&mut self, stage_ns: &[u64]) {
+        for (stage, time_ns) in Stage::POLICY.into_iter().zip(stage_ns).filter(|(_, time_ns)| **time_ns > 0) {
+            self.record(stage, *time_ns);
+        }
+    }
+
     /// What was recorded for a stage.
     #[must_use]
     pub fn latency(&self, stage: Stage) -> Latency {
