@@ -32,7 +32,7 @@ pub struct Grant {
 }
 
 /// Everything that was asked for, and the kernel it was asked of.
-#[derive(Debug, Clone, PartialEq, Eq, Serialize)]
+#[derive(Debug, Clone, PartialEq, Serialize)]
 pub struct Granted {
     /// One entry for each thing that was asked for.
     pub grants: Vec<Grant>,
