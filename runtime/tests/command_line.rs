@@ -119,6 +119,8 @@ fn a_peer_that_falls_silent_ends_the_run_with_its_own_exit_code_and_what_was_gra
         "test",
         "--silence-max",
         "0.3",
+        "--threads",
+        "1",
         "--cpu",
         "0",
         "--realtime",
