@@ -7,7 +7,7 @@ use std::ops::Range;
 
 use pulp::{Arch, Simd, WithSimd};
 
-use super::matrix::Lines;
+use super::weights::Lines;
 
 /// Kernel size.
 const KERNEL: usize = 4;

@@ -3,7 +3,9 @@
 //! | module | computes | bound by |
 //! | --- | --- | --- |
 //! | [`conv`] | convolution of kernel 4 and stride 2, rows of pixels in, rows of pixels out | arithmetic |
-//! | [`matrix`] | a vector times a matrix that was laid out once, and sums of rows of a table | memory |
+//! | [`matrix`] | a vector times a matrix that was laid out once | memory |
+//! | [`table`] | sums of rows of a table | memory |
+//! | [`weights`] | how weights lie in memory | |
 //! | [`norm`] | LayerNorm and `SiLU` over rows | arithmetic |
 //! | [`latents`] | log-probabilities of the categoricals, their classes, their divergence | arithmetic |
 //!
@@ -14,3 +16,5 @@ pub mod latents;
 mod math;
 pub mod matrix;
 pub mod norm;
+pub mod table;
+pub mod weights;

@@ -1,14 +1,15 @@
 //! Convolution of kernel 4 and stride 2, norm and `SiLU`, channels last; reads floats or bytes.
 
-use std::sync::Arc;
+use std::sync::PoisonError;
 
 use pulp::Arch;
 use tract_onnx::pb::NodeProto;
 use tract_onnx::tract_hir::internal::*;
 
 use super::build::{Context, own};
-use super::memory::{Pieces, Results, slice, stateful_op};
+use super::memory::{Pieces, slice};
 use super::norm::norm_of;
+use super::own::{Compute, Own};
 use super::{CONV, SharedTeam};
 use crate::kernels::conv::Conv;
 use crate::kernels::norm::Norm;
@@ -32,12 +33,12 @@ pub(super) fn build(_: &Context<'_>, node: &NodeProto) -> TractResult<(Box<dyn I
         };
         let conv = Conv::new(weight, channels_in, channels_out, side);
         let block = Block { conv, norm: norm_of(recipe, 2)?, from_bytes, shape: recipe.shape.into() };
-        Ok((Box::new(ConvolutionOp(Arc::new(block), None)), vec![0]))
+        Ok((Own::boxed(block), vec![0]))
     })
 }
 
 #[derive(Debug)]
-struct Block {
+pub(super) struct Block {
     conv: Conv,
     norm: Norm,
     /// `x / .0 + .1` of bytes, where bytes come in.
@@ -45,62 +46,49 @@ struct Block {
     shape: TVec<usize>,
 }
 
-#[derive(Debug, Clone)]
-pub(super) struct ConvolutionOp(Arc<Block>, Option<SharedTeam>);
+impl Compute for Block {
+    type Number = f32;
+    /// The image with its border.
+    type Scratch = Vec<f32>;
+    const NAME: &'static str = CONV;
 
-impl ConvolutionOp {
-    pub(super) fn settle(&mut self, team: Option<&SharedTeam>) {
-        let conv = &self.0.conv;
-        let flops = 2 * 16 * conv.len_in() / 4 * conv.channels_out();
-        self.1 = team.filter(|_| flops >= SHARED_FLOPS_MIN).cloned();
-    }
-}
-
-#[derive(Debug, Clone)]
-struct ConvolutionState {
-    padded: Vec<f32>,
-    results: Results,
-}
-
-impl ConvolutionState {
-    fn new(op: &ConvolutionOp) -> Self {
-        let block = &op.0;
-        Self {
-            padded: vec![0.0; block.conv.len_padded()],
-            results: Results::new(f32::datum_type(), &block.shape),
-        }
+    fn shape(&self) -> &[usize] {
+        &self.shape
     }
 
-    fn run(&mut self, op: &ConvolutionOp, inputs: &[TValue]) -> TractResult<TVec<TValue>> {
-        let (arch, Block { conv, norm, from_bytes, .. }) = (Arch::new(), &*op.0);
+    fn scratch(&self) -> Vec<f32> {
+        vec![0.0; self.conv.len_padded()]
+    }
+
+    fn is_worth_sharing(&self) -> bool {
+        2 * 16 * self.conv.len_in() / 4 * self.conv.channels_out() >= SHARED_FLOPS_MIN
+    }
+
+    fn run(
+        &self,
+        inputs: &[TValue],
+        padded: &mut Vec<f32>,
+        team: Option<&SharedTeam>,
+        out: &mut [f32],
+    ) -> TractResult<()> {
+        let (arch, Self { conv, norm, from_bytes, .. }) = (Arch::new(), self);
         match from_bytes {
-            Some(change) => conv.pad_bytes(arch, slice::<u8>(&inputs[0])?, *change, &mut self.padded),
-            None => conv.pad(slice::<f32>(&inputs[0])?, &mut self.padded),
+            Some(change) => conv.pad_bytes(arch, slice(&inputs[0])?, *change, padded),
+            None => conv.pad(slice(&inputs[0])?, padded),
         }
-        let (padded, side) = (self.padded.as_slice(), conv.side_out());
-        self.results.write(|out: &mut [f32]| {
-            let Some(team) = &op.1 else {
-                conv.run(arch, padded, 0..side, out);
-                return norm.run(arch, out);
-            };
-            let pieces = Pieces::new(out, ROWS * side * conv.channels_out());
-            let mut team = team.lock().unwrap_or_else(std::sync::PoisonError::into_inner);
-            team.each(pieces.count(), &|index| {
-                // SAFETY: a team runs every index once.
-                let out = unsafe { pieces.take(index) };
-                conv.run(arch, padded, ROWS * index..ROWS * (index + 1), out);
-                norm.run(arch, out);
-            });
-        })
+        let (padded, side) = (padded.as_slice(), conv.side_out());
+        let Some(team) = team else {
+            conv.run(arch, padded, 0..side, out);
+            norm.run(arch, out);
+            return Ok(());
+        };
+        let pieces = Pieces::new(out, ROWS * side * conv.channels_out());
+        team.lock().unwrap_or_else(PoisonError::into_inner).each(pieces.count(), &|index| {
+            // SAFETY: a team runs every index once.
+            let out = unsafe { pieces.take(index) };
+            conv.run(arch, padded, ROWS * index..ROWS * (index + 1), out);
+            norm.run(arch, out);
+        });
+        Ok(())
     }
-}
-
-stateful_op!(ConvolutionOp, ConvolutionState, CONV);
-
-impl TypedOp for ConvolutionOp {
-    fn output_facts(&self, _: &[&TypedFact]) -> TractResult<TVec<TypedFact>> {
-        Ok(tvec!(f32::fact(&self.0.shape)))
-    }
-
-    as_op!();
 }

@@ -1,14 +1,13 @@
 //! Logits to log-probabilities, and these with noise to classes.
 
-use std::sync::Arc;
-
 use pulp::Arch;
 use tract_onnx::pb::NodeProto;
 use tract_onnx::tract_hir::internal::*;
 
 use super::build::{Context, own};
-use super::memory::{Results, slice, stateful_op};
-use super::{DRAW, LOG_PROBS};
+use super::memory::slice;
+use super::own::{Compute, Own};
+use super::{DRAW, LOG_PROBS, SharedTeam};
 use crate::kernels::latents;
 
 pub(super) fn build_log_probs(
@@ -23,7 +22,7 @@ pub(super) fn build_log_probs(
         if recipe.input_len(0)? != shape.iter().product::<usize>() {
             bail!("log-probabilities of shape {shape:?} of other logits");
         }
-        Ok((Box::new(LogProbsOp(Arc::new(LogProbs { factor, offset, classes, shape }))), vec![0]))
+        Ok((Own::boxed(LogProbs { factor, offset, classes, shape }), vec![0]))
     })
 }
 
@@ -38,7 +37,7 @@ pub(super) fn build_draw(
         if recipe.input_len(0)? != len || recipe.input_len(1)? != len {
             bail!("classes of shape {shape:?}, {classes} each, of other log-probabilities or noise");
         }
-        Ok((Box::new(DrawOp(Arc::new(Draw { classes, shape }))), vec![0, 1]))
+        Ok((Own::boxed(Draw { classes, shape }), vec![0, 1]))
     })
 }
 
@@ -50,35 +49,28 @@ struct LogProbs {
     shape: TVec<usize>,
 }
 
-#[derive(Debug, Clone)]
-struct LogProbsOp(Arc<LogProbs>);
+impl Compute for LogProbs {
+    type Number = f32;
+    type Scratch = ();
+    const NAME: &'static str = LOG_PROBS;
 
-#[derive(Debug, Clone)]
-struct LogProbsState(Results);
-
-impl LogProbsState {
-    fn new(op: &LogProbsOp) -> Self {
-        Self(Results::new(f32::datum_type(), &op.0.shape))
+    fn shape(&self) -> &[usize] {
+        &self.shape
     }
 
-    fn run(&mut self, op: &LogProbsOp, inputs: &[TValue]) -> TractResult<TVec<TValue>> {
-        let logits = slice::<f32>(&inputs[0])?;
-        let LogProbs { factor, offset, classes, .. } = *op.0;
-        self.0.write(|out| {
-            out.copy_from_slice(logits);
-            latents::log_probs(Arch::new(), out, classes, factor, offset);
-        })
+    fn scratch(&self) {}
+
+    fn run(
+        &self,
+        inputs: &[TValue],
+        (): &mut (),
+        _: Option<&SharedTeam>,
+        out: &mut [f32],
+    ) -> TractResult<()> {
+        out.copy_from_slice(slice(&inputs[0])?);
+        latents::log_probs(Arch::new(), out, self.classes, self.factor, self.offset);
+        Ok(())
     }
-}
-
-stateful_op!(LogProbsOp, LogProbsState, LOG_PROBS);
-
-impl TypedOp for LogProbsOp {
-    fn output_facts(&self, _: &[&TypedFact]) -> TractResult<TVec<TypedFact>> {
-        Ok(tvec!(f32::fact(&self.0.shape)))
-    }
-
-    as_op!();
 }
 
 #[derive(Debug)]
@@ -87,29 +79,19 @@ struct Draw {
     shape: TVec<usize>,
 }
 
-#[derive(Debug, Clone)]
-struct DrawOp(Arc<Draw>);
+impl Compute for Draw {
+    type Number = i64;
+    type Scratch = ();
+    const NAME: &'static str = DRAW;
 
-#[derive(Debug, Clone)]
-struct DrawState(Results);
-
-impl DrawState {
-    fn new(op: &DrawOp) -> Self {
-        Self(Results::new(i64::datum_type(), &op.0.shape))
+    fn shape(&self) -> &[usize] {
+        &self.shape
     }
 
-    fn run(&mut self, op: &DrawOp, inputs: &[TValue]) -> TractResult<TVec<TValue>> {
-        let (log_probs, noise) = (slice::<f32>(&inputs[0])?, slice::<f32>(&inputs[1])?);
-        self.0.write(|z| latents::draw(log_probs, noise, op.0.classes, z))
+    fn scratch(&self) {}
+
+    fn run(&self, inputs: &[TValue], (): &mut (), _: Option<&SharedTeam>, z: &mut [i64]) -> TractResult<()> {
+        latents::draw(slice(&inputs[0])?, slice(&inputs[1])?, self.classes, z);
+        Ok(())
     }
-}
-
-stateful_op!(DrawOp, DrawState, DRAW);
-
-impl TypedOp for DrawOp {
-    fn output_facts(&self, _: &[&TypedFact]) -> TractResult<TVec<TypedFact>> {
-        Ok(tvec!(i64::fact(&self.0.shape)))
-    }
-
-    as_op!();
 }

@@ -1,17 +1,20 @@
 //! One row: the sum of products, of table rows and of values, perhaps with norm and `SiLU`.
 
-use std::sync::Arc;
+use std::sync::{Mutex, PoisonError};
 
 use pulp::Arch;
 use tract_onnx::pb::NodeProto;
 use tract_onnx::tract_hir::internal::*;
 
 use super::build::{Context, Recipe, own};
-use super::memory::{Pieces, Results, slice, stateful_op};
+use super::memory::{Pieces, slice};
 use super::norm::norm_of;
+use super::own::{Compute, Own};
 use super::{LAYER, SharedTeam, Term};
-use crate::kernels::matrix::{Matrix, Precision, Table};
+use crate::kernels::matrix::Matrix;
 use crate::kernels::norm::Norm;
+use crate::kernels::table::Table;
+use crate::kernels::weights::Precision;
 
 /// Weights below this are not worth sharing.
 const SHARED_WEIGHTS_MIN: usize = 1 << 16;
@@ -21,7 +24,7 @@ const COLUMNS: usize = 128;
 pub(super) fn build(_: &Context<'_>, node: &NodeProto) -> TractResult<(Box<dyn InferenceOp>, Vec<String>)> {
     own(node, f32::datum_type(), |recipe| {
         let (layer, read) = Layer::of(recipe)?;
-        Ok((Box::new(LayerOp(Arc::new(layer), None)), read))
+        Ok((Own::boxed(layer), read))
     })
 }
 
@@ -39,10 +42,9 @@ enum Part {
 }
 
 #[derive(Debug)]
-struct Layer {
+pub(super) struct Layer {
     parts: Vec<Part>,
     norm: Option<Norm>,
-    width: usize,
     shape: TVec<usize>,
 }
 
@@ -72,7 +74,7 @@ impl Layer {
             Some(_) => Some(norm_of(recipe, input)?),
             None => None,
         };
-        Ok((Self { parts, norm, width, shape: recipe.shape.into() }, read))
+        Ok((Self { parts, norm, shape: recipe.shape.into() }, read))
     }
 
     /// Number of weights.
@@ -110,6 +112,25 @@ impl Layer {
             }
         }
         Ok(())
+    }
+
+    fn shared_sum(
+        &self,
+        arch: Arch,
+        inputs: &[TValue],
+        out: &mut [f32],
+        team: &SharedTeam,
+    ) -> TractResult<()> {
+        let failed = Mutex::new(None);
+        let pieces = Pieces::new(out, COLUMNS);
+        team.lock().unwrap_or_else(PoisonError::into_inner).each(pieces.count(), &|index| {
+            // SAFETY: a team runs every index once.
+            let out = unsafe { pieces.take(index) };
+            if let Err(error) = self.sum(arch, inputs, COLUMNS * index, out) {
+                *failed.lock().unwrap_or_else(PoisonError::into_inner) = Some(error);
+            }
+        });
+        failed.into_inner().unwrap_or_else(PoisonError::into_inner).map_or(Ok(()), Err)
     }
 }
 
@@ -157,65 +178,36 @@ impl Part {
     }
 }
 
-#[derive(Debug, Clone)]
-pub(super) struct LayerOp(Arc<Layer>, Option<SharedTeam>);
+impl Compute for Layer {
+    type Number = f32;
+    type Scratch = ();
+    const NAME: &'static str = LAYER;
 
-impl LayerOp {
-    pub(super) fn settle(&mut self, team: Option<&SharedTeam>) {
-        self.1 = team.filter(|_| self.0.weights() >= SHARED_WEIGHTS_MIN).cloned();
-    }
-}
-
-#[derive(Debug, Clone)]
-struct LayerState(Results);
-
-impl LayerState {
-    fn new(op: &LayerOp) -> Self {
-        Self(Results::new(f32::datum_type(), &op.0.shape))
+    fn shape(&self) -> &[usize] {
+        &self.shape
     }
 
-    fn run(&mut self, op: &LayerOp, inputs: &[TValue]) -> TractResult<TVec<TValue>> {
-        let (arch, layer) = (Arch::new(), &*op.0);
-        let mut done = Ok(());
-        let results = self.0.write(|out: &mut [f32]| {
-            done = match &op.1 {
-                None => layer.sum(arch, inputs, 0, out),
-                Some(team) => shared_sum(arch, layer, inputs, out, team),
-            };
-            if let Some(norm) = &layer.norm {
-                norm.run(arch, out);
-            }
-        });
-        done.and(results)
-    }
-}
+    fn scratch(&self) {}
 
-fn shared_sum(
-    arch: Arch,
-    layer: &Layer,
-    inputs: &[TValue],
-    out: &mut [f32],
-    team: &SharedTeam,
-) -> TractResult<()> {
-    let failed = std::sync::atomic::AtomicBool::new(false);
-    let pieces = Pieces::new(out, COLUMNS);
-    let mut team = team.lock().unwrap_or_else(std::sync::PoisonError::into_inner);
-    team.each(pieces.count(), &|index| {
-        // SAFETY: a team runs every index once.
-        let out = unsafe { pieces.take(index) };
-        if layer.sum(arch, inputs, COLUMNS * index, out).is_err() {
-            failed.store(true, std::sync::atomic::Ordering::Relaxed);
+    fn is_worth_sharing(&self) -> bool {
+        self.weights() >= SHARED_WEIGHTS_MIN
+    }
+
+    fn run(
+        &self,
+        inputs: &[TValue],
+        (): &mut (),
+        team: Option<&SharedTeam>,
+        out: &mut [f32],
+    ) -> TractResult<()> {
+        let arch = Arch::new();
+        match team {
+            None => self.sum(arch, inputs, 0, out)?,
+            Some(team) => self.shared_sum(arch, inputs, out, team)?,
         }
-    });
-    if failed.into_inner() { layer.sum(arch, inputs, 0, &mut vec![0.0; layer.width]) } else { Ok(()) }
-}
-
-stateful_op!(LayerOp, LayerState, LAYER);
-
-impl TypedOp for LayerOp {
-    fn output_facts(&self, _: &[&TypedFact]) -> TractResult<TVec<TypedFact>> {
-        Ok(tvec!(f32::fact(&self.0.shape)))
+        if let Some(norm) = &self.norm {
+            norm.run(arch, out);
+        }
+        Ok(())
     }
-
-    as_op!();
 }

@@ -19,7 +19,10 @@ impl Results {
     }
 
     /// A tensor that nobody else reads, filled by `write`. Its old contents are what they were.
-    pub(super) fn write<T: Datum>(&mut self, write: impl FnOnce(&mut [T])) -> TractResult<TVec<TValue>> {
+    pub(super) fn write<T: Datum>(
+        &mut self,
+        write: impl FnOnce(&mut [T]) -> TractResult<()>,
+    ) -> TractResult<TVec<TValue>> {
         let free = self.tensors.iter_mut().position(|tensor| Arc::get_mut(tensor).is_some());
         let index = match free {
             Some(index) => index,
@@ -29,7 +32,7 @@ impl Results {
             }
         };
         if let Some(tensor) = Arc::get_mut(&mut self.tensors[index]) {
-            write(tensor.try_as_plain_ram_mut()?.as_slice_mut::<T>()?);
+            write(tensor.try_as_plain_ram_mut()?.as_slice_mut::<T>()?)?;
         }
         Ok(tvec!(Arc::clone(&self.tensors[index]).into_tvalue()))
     }
@@ -71,50 +74,3 @@ impl<'a, T> Pieces<'a, T> {
         unsafe { std::slice::from_raw_parts_mut(self.start.add(first), self.piece.min(self.len - first)) }
     }
 }
-
-/// What all our operators say about themselves: stateful, nothing folded, one stream.
-macro_rules! stateful_op {
-    ($op:ty, $state:ty, $name:expr) => {
-        impl PartialEq for $op {
-            fn eq(&self, other: &Self) -> bool {
-                std::sync::Arc::ptr_eq(&self.0, &other.0)
-            }
-        }
-
-        impl Eq for $op {}
-
-        impl tract_onnx::tract_core::ops::Op for $op {
-            fn name(&self) -> StaticName {
-                $name.into()
-            }
-
-            op_as_typed_op!();
-        }
-
-        impl EvalOp for $op {
-            not_out_of_plan!();
-
-            fn state(&self, _: &EvalContext<'_>) -> TractResult<Option<Box<dyn OpState>>> {
-                Ok(Some(Box::new(<$state>::new(self))))
-            }
-        }
-
-        impl OpState for $state {
-            fn eval(
-                &mut self,
-                _: &EvalContext<'_>,
-                op: &dyn Op,
-                inputs: TVec<TValue>,
-            ) -> TractResult<TVec<TValue>> {
-                let op = op.downcast_ref::<$op>().ok_or_else(|| format_err!("state of another operator"))?;
-                self.run(op, &inputs)
-            }
-
-            fn reset_lanes(&mut self, _: &[LaneId]) -> TractResult<()> {
-                Ok(())
-            }
-        }
-    };
-}
-
-pub(super) use stateful_op;

@@ -9,12 +9,14 @@ mod latents;
 mod layer;
 mod memory;
 mod norm;
+mod own;
 
 use std::sync::{Arc, Mutex};
 
 use tract_onnx::prelude::TypedModel;
 
 use crate::team::Team;
+use own::Own;
 
 /// Domain of the operators.
 pub const DOMAIN: &str = "rcwm";
@@ -81,10 +83,7 @@ pub fn onnx() -> tract_onnx::Onnx {
 /// Tells our operators of a model with whom to share large work.
 pub fn settle(model: &mut TypedModel, team: Option<&SharedTeam>) {
     for node in &mut model.nodes {
-        if let Some(op) = node.op_as_mut::<convolution::ConvolutionOp>() {
-            op.settle(team);
-        } else if let Some(op) = node.op_as_mut::<layer::LayerOp>() {
-            op.settle(team);
-        }
+        Own::<convolution::Block>::settle(node, team);
+        Own::<layer::Layer>::settle(node, team);
     }
 }

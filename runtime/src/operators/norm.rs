@@ -1,20 +1,18 @@
 //! LayerNorm over the last dimension, perhaps with `SiLU`.
 
-use std::sync::Arc;
-
 use pulp::Arch;
 use tract_onnx::pb::NodeProto;
 use tract_onnx::tract_hir::internal::*;
 
-use super::NORM;
 use super::build::{Context, Recipe, own};
-use super::memory::{Results, slice, stateful_op};
+use super::memory::slice;
+use super::own::{Compute, Own};
+use super::{NORM, SharedTeam};
 use crate::kernels::norm::Norm;
 
 pub(super) fn build(_: &Context<'_>, node: &NodeProto) -> TractResult<(Box<dyn InferenceOp>, Vec<String>)> {
     own(node, f32::datum_type(), |recipe| {
-        let op = NormOp(Arc::new(NormRows { norm: norm_of(recipe, 1)?, shape: recipe.shape.into() }));
-        Ok((Box::new(op), vec![0]))
+        Ok((Own::boxed(NormRows { norm: norm_of(recipe, 1)?, shape: recipe.shape.into() }), vec![0]))
     })
 }
 
@@ -29,37 +27,31 @@ pub(super) fn norm_of(recipe: &Recipe<'_>, first: usize) -> TractResult<Norm> {
 }
 
 #[derive(Debug)]
-struct NormRows {
+pub(super) struct NormRows {
     norm: Norm,
     shape: TVec<usize>,
 }
 
-#[derive(Debug, Clone)]
-struct NormOp(Arc<NormRows>);
+impl Compute for NormRows {
+    type Number = f32;
+    type Scratch = ();
+    const NAME: &'static str = NORM;
 
-#[derive(Debug, Clone)]
-struct NormState(Results);
-
-impl NormState {
-    fn new(op: &NormOp) -> Self {
-        Self(Results::new(f32::datum_type(), &op.0.shape))
+    fn shape(&self) -> &[usize] {
+        &self.shape
     }
 
-    fn run(&mut self, op: &NormOp, inputs: &[TValue]) -> TractResult<TVec<TValue>> {
-        let x = slice::<f32>(&inputs[0])?;
-        self.0.write(|out| {
-            out.copy_from_slice(x);
-            op.0.norm.run(Arch::new(), out);
-        })
+    fn scratch(&self) {}
+
+    fn run(
+        &self,
+        inputs: &[TValue],
+        (): &mut (),
+        _: Option<&SharedTeam>,
+        out: &mut [f32],
+    ) -> TractResult<()> {
+        out.copy_from_slice(slice(&inputs[0])?);
+        self.norm.run(Arch::new(), out);
+        Ok(())
     }
-}
-
-stateful_op!(NormOp, NormState, NORM);
-
-impl TypedOp for NormOp {
-    fn output_facts(&self, _: &[&TypedFact]) -> TractResult<TVec<TypedFact>> {
-        Ok(tvec!(f32::fact(&self.0.shape)))
-    }
-
-    as_op!();
 }
