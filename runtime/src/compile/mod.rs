@@ -70,7 +70,9 @@ impl Default for Optimizations {
 #[derive(Debug, thiserror::Error)]
 pub enum CompileError {
     /// A part cannot be read.
-    #[error("{part}: {reason}")]
+    #[error(
+        "compiling {part}: {reason}; export the bundle again, or run its parts as they are with --engine ort"
+    )]
     Part {
         /// The part.
         part: PartName,

@@ -12,11 +12,10 @@ use rcwm_models::ACTION_LEN;
 use rcwm_models::bundle::{Bundle, PartName};
 use tract_onnx::prelude::{TValue, TVec, TractResult};
 
-use super::noise::NoiseSource;
-use super::parts::{BranchBuffers, finite};
+use super::parts::finite;
 use super::stages::StageClock;
-use super::tick::Tick;
-use super::{Buffers, PolicyError, State};
+use super::tick::{Tick, Work};
+use super::{Buffers, PolicyError};
 use crate::compile::{CompileError, Optimizations, compile, inputs};
 use crate::engine::{EngineError, weights};
 use crate::operators::SharedTeam;
@@ -40,7 +39,7 @@ pub(super) struct Compiled {
 
 const BRANCHES: [PartName; 2] = [PartName::Robot, PartName::Environment];
 /// Outputs of a branch that must be known before the image is.
-const PRIOR: [&str; 3] = ["h_next", "prior_z", "prior_log_probs"];
+const PRIOR: [usize; 3] = [H_NEXT, PRIOR_Z, PRIOR_LOG_PROBS];
 
 impl Compiled {
     pub(super) fn load(
@@ -65,8 +64,8 @@ impl Compiled {
             if segment.late { late.push(piece) } else { early.push(piece) }
         }
         for branch in BRANCHES {
-            for name in PRIOR.map(|name| format!("{branch}/{name}")) {
-                if !early.iter().any(|piece| piece.makes(&values, &name)) {
+            for name in PRIOR.map(|output| output_name(branch, output)) {
+                if !early.iter().any(|piece| piece.makes(&values, name)) {
                     let reason = format!("{name} depends on the image; a prior must not");
                     return Err(CompileError::Part { part: branch, reason }.into());
                 }
@@ -110,17 +109,62 @@ impl Compiled {
         Ok(())
     }
 
-    fn act(&mut self, buffers: &mut Buffers, clock: &mut StageClock) -> Result<(), PolicyError> {
-        self.actor.run(&mut self.values).map_err(|error| run_error(PartName::Actor, &error))?;
-        self.values
-            .copy("actor/mean", &mut buffers.mean)
-            .map_err(|error| run_error(PartName::Actor, &error))?;
-        self.values
-            .copy("actor/std", &mut buffers.std)
-            .map_err(|error| run_error(PartName::Actor, &error))?;
+    /// The actor on the state that is there.
+    fn act(&mut self, work: &mut Work<'_>) -> Result<(), PolicyError> {
+        let Self { actor, values, .. } = self;
+        let Work { buffers, clock, .. } = work;
+        let mut run = || {
+            actor.run(values)?;
+            values.copy("actor/mean", &mut buffers.mean)?;
+            values.copy("actor/std", &mut buffers.std)
+        };
+        run().map_err(|error| run_error(PartName::Actor, &error))?;
         clock.ended(PartName::Actor);
         finite(PartName::Actor, "mean", &buffers.mean)?;
         finite(PartName::Actor, "std", &buffers.std)
+    }
+
+    /// The tick's inputs but the image.
+    fn fill(&mut self, action: &[f32; ACTION_LEN], work: &Work<'_>) -> TractResult<()> {
+        let (values, Work { state, noise, .. }) = (&mut self.values, work);
+        values.fill(inputs::ACTION, action.as_slice())?;
+        values.fill(inputs::ROBOT_Z, &state.robot.z)?;
+        values.fill(inputs::ROBOT_H, &state.robot.h)?;
+        values.fill(inputs::ROBOT_NOISE, noise.robot())?;
+        values.fill(inputs::ENVIRONMENT_Z, &state.environment.z)?;
+        values.fill(inputs::ENVIRONMENT_H, &state.environment.h)?;
+        values.fill(inputs::ENVIRONMENT_NOISE, noise.environment())
+    }
+
+    /// What the early pieces have made.
+    fn copy_priors(&self, buffers: &mut Buffers) -> Result<(), PolicyError> {
+        let values = &self.values;
+        for (part, branch) in buffers.branches() {
+            let mut copy = || {
+                values.copy(output_name(part, H_NEXT), &mut branch.h_next)?;
+                values.copy(output_name(part, PRIOR_Z), &mut branch.prior_z)?;
+                values.copy(output_name(part, PRIOR_LOG_PROBS), &mut branch.prior_log_probs)
+            };
+            copy().map_err(|error| run_error(part, &error))?;
+        }
+        let mut copy = || {
+            values.copy("interaction/e", &mut buffers.e)?;
+            values.copy("interaction/attention", &mut buffers.attention)
+        };
+        copy().map_err(|error| run_error(PartName::Interaction, &error))
+    }
+
+    /// What the branches have made of the image.
+    fn copy_posteriors(&self, buffers: &mut Buffers) -> Result<(), PolicyError> {
+        let values = &self.values;
+        for (part, branch) in buffers.branches() {
+            let mut copy = || {
+                values.copy(output_name(part, POSTERIOR_Z), &mut branch.posterior_z)?;
+                values.copy(output_name(part, POSTERIOR_LOG_PROBS), &mut branch.posterior_log_probs)
+            };
+            copy().map_err(|error| run_error(part, &error))?;
+        }
+        Ok(())
     }
 }
 
@@ -147,85 +191,34 @@ fn run_error(part: PartName, error: &tract_onnx::prelude::TractError) -> PolicyE
 }
 
 impl Tick for Compiled {
-    fn work_ahead(
-        &mut self,
-        state: &State,
-        action: &[f32; ACTION_LEN],
-        noise: &NoiseSource,
-        buffers: &mut Buffers,
-        clock: &mut StageClock,
-    ) -> Result<(), PolicyError> {
-        let fill = |values: &mut Values| {
-            values.fill(inputs::ACTION, action.as_slice())?;
-            values.fill(inputs::ROBOT_Z, &state.robot.z)?;
-            values.fill(inputs::ROBOT_H, &state.robot.h)?;
-            values.fill(inputs::ROBOT_NOISE, noise.robot())?;
-            values.fill(inputs::ENVIRONMENT_Z, &state.environment.z)?;
-            values.fill(inputs::ENVIRONMENT_H, &state.environment.h)?;
-            values.fill(inputs::ENVIRONMENT_NOISE, noise.environment())
-        };
-        fill(&mut self.values).map_err(|error| run_error(PartName::Robot, &error))?;
+    fn work_ahead(&mut self, action: &[f32; ACTION_LEN], work: &mut Work<'_>) -> Result<(), PolicyError> {
+        self.fill(action, work).map_err(|error| run_error(PartName::Robot, &error))?;
         for piece in &mut self.early {
             piece.run(&mut self.values).map_err(|error| run_error(piece.part, &error))?;
-            clock.ended(piece.part);
+            work.clock.ended(piece.part);
         }
-        let values = &self.values;
-        let copy = |part, branch: &mut BranchBuffers| {
-            values.copy(output_name(part, 0), &mut branch.h_next)?;
-            values.copy(output_name(part, 1), &mut branch.prior_z)?;
-            values.copy(output_name(part, 2), &mut branch.prior_log_probs)
-        };
-        copy(PartName::Robot, &mut buffers.robot).map_err(|error| run_error(PartName::Robot, &error))?;
-        copy(PartName::Environment, &mut buffers.environment)
-            .map_err(|error| run_error(PartName::Environment, &error))?;
-        values
-            .copy("interaction/e", &mut buffers.e)
-            .map_err(|error| run_error(PartName::Interaction, &error))?;
-        values
-            .copy("interaction/attention", &mut buffers.attention)
-            .map_err(|error| run_error(PartName::Interaction, &error))?;
-        finite(PartName::Interaction, "e", &buffers.e)?;
-        buffers.check_priors()
+        self.copy_priors(work.buffers)?;
+        finite(PartName::Interaction, "e", &work.buffers.e)?;
+        work.buffers.check_priors()
     }
 
-    fn observe(
-        &mut self,
-        image: &[u8],
-        _: &State,
-        _: &NoiseSource,
-        buffers: &mut Buffers,
-        clock: &mut StageClock,
-    ) -> Result<(), PolicyError> {
-        self.values.fill(inputs::IMAGE, image).map_err(|error| run_error(PartName::Encoder, &error))?;
-        self.encoder.run(&mut self.values).map_err(|error| run_error(PartName::Encoder, &error))?;
-        clock.ended(PartName::Encoder);
-        self.run_branches(clock).map_err(|error| run_error(PartName::Robot, &error))?;
-        for (part, branch) in
-            [(PartName::Robot, &mut buffers.robot), (PartName::Environment, &mut buffers.environment)]
-        {
-            let (z, log_probs) = (output_name(part, 3), output_name(part, 4));
-            let values = &self.values;
-            values.copy(z, &mut branch.posterior_z).map_err(|error| run_error(part, &error))?;
-            values
-                .copy(log_probs, &mut branch.posterior_log_probs)
-                .map_err(|error| run_error(part, &error))?;
-        }
-        buffers.check_posteriors()?;
-        self.act(buffers, clock)
+    fn observe(&mut self, image: &[u8], work: &mut Work<'_>) -> Result<(), PolicyError> {
+        let Self { values, encoder, .. } = self;
+        let encoded = values.fill(inputs::IMAGE, image).and_then(|()| encoder.run(values));
+        encoded.map_err(|error| run_error(PartName::Encoder, &error))?;
+        work.clock.ended(PartName::Encoder);
+        self.run_branches(work.clock).map_err(|error| run_error(PartName::Robot, &error))?;
+        self.copy_posteriors(work.buffers)?;
+        work.buffers.check_posteriors()?;
+        self.act(work)
     }
 
-    fn imagine(
-        &mut self,
-        _: &State,
-        _: &NoiseSource,
-        buffers: &mut Buffers,
-        clock: &mut StageClock,
-    ) -> Result<(), PolicyError> {
+    fn imagine(&mut self, work: &mut Work<'_>) -> Result<(), PolicyError> {
         for part in BRANCHES {
-            self.values.alias(output_name(part, 1), output_name(part, 3));
+            self.values.alias(output_name(part, PRIOR_Z), output_name(part, POSTERIOR_Z));
         }
-        buffers.believe_prior();
-        self.act(buffers, clock)
+        work.buffers.believe_prior();
+        self.act(work)
     }
 
     fn wake(&self) {
@@ -235,7 +228,14 @@ impl Tick for Compiled {
     }
 }
 
-/// Name of an output of a branch in the whole tick: h, prior z and log-probabilities, posterior z and log-probabilities.
+// Outputs of a branch, as places in the list below.
+const H_NEXT: usize = 0;
+const PRIOR_Z: usize = 1;
+const PRIOR_LOG_PROBS: usize = 2;
+const POSTERIOR_Z: usize = 3;
+const POSTERIOR_LOG_PROBS: usize = 4;
+
+/// Name of an output of a branch in the whole tick. Spelled out, so that none is put together while a tick runs.
 const fn output_name(part: PartName, output: usize) -> &'static str {
     const ROBOT: [&str; 5] = [
         "robot/h_next",

@@ -39,7 +39,7 @@ use crate::engine::{EngineError, EngineSettings};
 use calls::CallRing;
 use noise::NoiseSource;
 use stages::StageClock;
-use tick::Tick;
+use tick::{Tick, Work};
 
 /// Why there is no policy, or no decision.
 #[derive(Debug, thiserror::Error)]
@@ -205,10 +205,10 @@ impl Policy {
         }
         let mut clock = StageClock::start();
         let recomputed = self.prepare(before, &mut clock)?;
-        let Self { tick, buffers, state, noise, .. } = self;
         // From here on the buffers hold a tick that may fail half-way.
         self.ahead = None;
-        tick.observe(image, state, noise, buffers, &mut clock)?;
+        let (tick, mut work) = self.work(&mut clock);
+        tick.observe(image, &mut work)?;
         self.state.take_posterior(&self.buffers);
         let surprise = Some(self.buffers.surprise());
         Ok(self.decide(clock.spent_ns, surprise, recomputed))
@@ -256,9 +256,9 @@ impl Policy {
         let before = Self::before(Some(executed_action))?;
         let mut clock = StageClock::start();
         let recomputed = self.prepare(before, &mut clock)?;
-        let Self { tick, buffers, state, noise, .. } = self;
         self.ahead = None;
-        tick.imagine(state, noise, buffers, &mut clock)?;
+        let (tick, mut work) = self.work(&mut clock);
+        tick.imagine(&mut work)?;
         self.state.take_posterior(&self.buffers);
         Ok(self.decide(clock.spent_ns, None, recomputed))
     }
@@ -287,10 +287,15 @@ impl Policy {
             Before::Start => [0.0; ACTION_LEN],
             Before::Action(action) => action,
         };
-        let Self { tick, buffers, state, noise, .. } = self;
-        tick.work_ahead(state, &action, noise, buffers, clock)?;
+        let (tick, mut work) = self.work(clock);
+        tick.work_ahead(&action, &mut work)?;
         self.ahead = Some(before);
         Ok(other)
+    }
+
+    fn work<'a>(&'a mut self, clock: &'a mut StageClock) -> (&'a mut dyn Tick, Work<'a>) {
+        let Self { tick, buffers, state, noise, .. } = self;
+        (tick.as_mut(), Work { state, noise, buffers, clock })
     }
 
     fn decide(

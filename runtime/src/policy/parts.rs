@@ -69,6 +69,11 @@ impl Buffers {
 }
 
 impl Buffers {
+    /// Both branches by name.
+    pub(super) fn branches(&mut self) -> [(PartName, &mut BranchBuffers); 2] {
+        [(PartName::Robot, &mut self.robot), (PartName::Environment, &mut self.environment)]
+    }
+
     pub(super) fn surprise(&self) -> Surprise {
         Surprise { robot: self.robot.surprise(), environment: self.environment.surprise() }
     }
@@ -87,7 +92,7 @@ impl Buffers {
 
     /// The prior stands in for the posterior, as where there is no image.
     pub(super) fn believe_prior(&mut self) {
-        for branch in [&mut self.robot, &mut self.environment] {
+        for (_, branch) in self.branches() {
             branch.posterior_z.copy_from_slice(&branch.prior_z);
             branch.posterior_log_probs.copy_from_slice(&branch.prior_log_probs);
         }

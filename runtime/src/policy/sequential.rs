@@ -5,11 +5,9 @@
 use rcwm_models::ACTION_LEN;
 use rcwm_models::bundle::{Bundle, PartName};
 
-use super::noise::NoiseSource;
+use super::PolicyError;
 use super::parts::Parts;
-use super::stages::StageClock;
-use super::tick::Tick;
-use super::{Buffers, PolicyError, State};
+use super::tick::{Tick, Work};
 use crate::engine::{EngineError, EngineSettings};
 
 /// The five parts of a tick and the action before it.
@@ -23,13 +21,8 @@ impl Sequential {
         Ok(Self { parts: Parts::load(bundle, settings)?, action: [0.0; ACTION_LEN] })
     }
 
-    fn branches(
-        &mut self,
-        state: &State,
-        noise: &NoiseSource,
-        buffers: &mut Buffers,
-        clock: &mut StageClock,
-    ) -> Result<(), PolicyError> {
+    fn branches(&mut self, work: &mut Work<'_>) -> Result<(), PolicyError> {
+        let Work { state, noise, buffers, clock } = work;
         self.parts.run_robot(&state.robot, &self.action, noise.robot(), buffers)?;
         clock.ended(PartName::Robot);
         self.parts.run_interaction(&state.environment, buffers)?;
@@ -39,51 +32,31 @@ impl Sequential {
         Ok(())
     }
 
-    fn act(&mut self, buffers: &mut Buffers, clock: &mut StageClock) -> Result<(), PolicyError> {
-        self.parts.run_actor(buffers)?;
-        clock.ended(PartName::Actor);
+    fn act(&mut self, work: &mut Work<'_>) -> Result<(), PolicyError> {
+        self.parts.run_actor(work.buffers)?;
+        work.clock.ended(PartName::Actor);
         Ok(())
     }
 }
 
 impl Tick for Sequential {
     /// Remembers the action: all else waits for the image.
-    fn work_ahead(
-        &mut self,
-        _: &State,
-        action: &[f32; ACTION_LEN],
-        _: &NoiseSource,
-        _: &mut Buffers,
-        _: &mut StageClock,
-    ) -> Result<(), PolicyError> {
+    fn work_ahead(&mut self, action: &[f32; ACTION_LEN], _: &mut Work<'_>) -> Result<(), PolicyError> {
         self.action = *action;
         Ok(())
     }
 
-    fn observe(
-        &mut self,
-        image: &[u8],
-        state: &State,
-        noise: &NoiseSource,
-        buffers: &mut Buffers,
-        clock: &mut StageClock,
-    ) -> Result<(), PolicyError> {
-        self.parts.run_encoder(image, buffers)?;
-        clock.ended(PartName::Encoder);
-        self.branches(state, noise, buffers, clock)?;
-        self.act(buffers, clock)
+    fn observe(&mut self, image: &[u8], work: &mut Work<'_>) -> Result<(), PolicyError> {
+        self.parts.run_encoder(image, work.buffers)?;
+        work.clock.ended(PartName::Encoder);
+        self.branches(work)?;
+        self.act(work)
     }
 
     /// The branches run on the features of the last image; what they make of them is not used.
-    fn imagine(
-        &mut self,
-        state: &State,
-        noise: &NoiseSource,
-        buffers: &mut Buffers,
-        clock: &mut StageClock,
-    ) -> Result<(), PolicyError> {
-        self.branches(state, noise, buffers, clock)?;
-        buffers.believe_prior();
-        self.act(buffers, clock)
+    fn imagine(&mut self, work: &mut Work<'_>) -> Result<(), PolicyError> {
+        self.branches(work)?;
+        work.buffers.believe_prior();
+        self.act(work)
     }
 }

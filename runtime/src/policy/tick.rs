@@ -10,36 +10,24 @@ use super::stages::StageClock;
 use super::{Buffers, PolicyError, State};
 use crate::engine::{EngineSettings, Form};
 
-/// The three things a tick is made of. What is computed is left in the buffers; the state is the caller's.
+/// What a tick works on. What is computed is left in the buffers; the state is the caller's.
+pub(super) struct Work<'a> {
+    pub(super) state: &'a State,
+    pub(super) noise: &'a NoiseSource,
+    pub(super) buffers: &'a mut Buffers,
+    pub(super) clock: &'a mut StageClock,
+}
+
+/// The three things a tick is made of.
 pub(super) trait Tick: Send {
     /// All that needs only the action.
-    fn work_ahead(
-        &mut self,
-        state: &State,
-        action: &[f32; ACTION_LEN],
-        noise: &NoiseSource,
-        buffers: &mut Buffers,
-        clock: &mut StageClock,
-    ) -> Result<(), PolicyError>;
+    fn work_ahead(&mut self, action: &[f32; ACTION_LEN], work: &mut Work<'_>) -> Result<(), PolicyError>;
 
-    /// All else, once the image is there.
-    fn observe(
-        &mut self,
-        image: &[u8],
-        state: &State,
-        noise: &NoiseSource,
-        buffers: &mut Buffers,
-        clock: &mut StageClock,
-    ) -> Result<(), PolicyError>;
+    /// All else, once the image is there: 64 x 64 x 3 bytes.
+    fn observe(&mut self, image: &[u8], work: &mut Work<'_>) -> Result<(), PolicyError>;
 
     /// All else without an image: the prior stands in for the posterior.
-    fn imagine(
-        &mut self,
-        state: &State,
-        noise: &NoiseSource,
-        buffers: &mut Buffers,
-        clock: &mut StageClock,
-    ) -> Result<(), PolicyError>;
+    fn imagine(&mut self, work: &mut Work<'_>) -> Result<(), PolicyError>;
 
     /// An image is about to come.
     fn wake(&self) {}
