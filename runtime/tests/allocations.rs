@@ -4,55 +4,19 @@
 
 mod support;
 
-use std::alloc::{GlobalAlloc, Layout, System};
-use std::cell::Cell;
-
 use rcwm_models::bundle::Bundle;
 use rcwm_models::onnx::data_type;
 use rcwm_runtime::compile::{Optimizations, Segment, compile};
 use rcwm_runtime::engine::EngineKind;
 use rcwm_runtime::policy::Sampling;
 use rcwm_runtime::{EngineSettings, Policy, operators};
+use support::counting::{Counting, allocations};
 use support::{image, smallest_bundle};
 use tract_onnx::prelude::*;
 use tract_onnx::tract_core::plan::eval;
 
-thread_local! {
-    static COUNT: Cell<u64> = const { Cell::new(0) };
-}
-
-/// The system's allocator, counting what each thread asks for.
-struct Counting;
-
-// SAFETY: all is handed on to the system's allocator; counting touches a thread-local number only.
-unsafe impl GlobalAlloc for Counting {
-    unsafe fn alloc(&self, layout: Layout) -> *mut u8 {
-        COUNT.with(|count| count.set(count.get() + 1));
-        // SAFETY: the caller's.
-        unsafe { System.alloc(layout) }
-    }
-
-    unsafe fn dealloc(&self, place: *mut u8, layout: Layout) {
-        // SAFETY: the caller's.
-        unsafe { System.dealloc(place, layout) }
-    }
-
-    unsafe fn realloc(&self, place: *mut u8, layout: Layout, size: usize) -> *mut u8 {
-        COUNT.with(|count| count.set(count.get() + 1));
-        // SAFETY: the caller's.
-        unsafe { System.realloc(place, layout, size) }
-    }
-}
-
 #[global_allocator]
 static ALLOCATOR: Counting = Counting;
-
-/// Allocations of this thread in `work`.
-fn allocations<T>(work: impl FnOnce() -> T) -> (u64, T) {
-    let before = COUNT.get();
-    let result = work();
-    (COUNT.get() - before, result)
-}
 
 fn policy(bundle: &Bundle) -> Policy {
     Policy::new(bundle, EngineSettings::single_threaded(EngineKind::Tract), Sampling::Sample { seed: 1 })

@@ -4,8 +4,6 @@
 
 mod support;
 
-use std::alloc::{GlobalAlloc, Layout, System};
-use std::cell::Cell;
 use std::time::Duration;
 
 use rcwm_models::wire::Action;
@@ -14,28 +12,8 @@ use rcwm_runtime::log::{LogSettings, Logger};
 use rcwm_runtime::policy::Sampling;
 use rcwm_runtime::telemetry::{SnapshotSettings, Snapshots, Stage, Telemetry};
 use rcwm_runtime::{EngineSettings, Policy};
+use support::counting::{Counting, allocations};
 use support::{observation, smallest_bundle};
-
-thread_local! {
-    static ALLOCATIONS: Cell<u64> = const { Cell::new(0) };
-}
-
-/// Counts the allocations of each thread.
-struct Counting;
-
-// SAFETY: every call is passed on to the system's allocator as it is.
-unsafe impl GlobalAlloc for Counting {
-    unsafe fn alloc(&self, layout: Layout) -> *mut u8 {
-        ALLOCATIONS.set(ALLOCATIONS.get() + 1);
-        // SAFETY: the caller keeps the contract of `alloc`.
-        unsafe { System.alloc(layout) }
-    }
-
-    unsafe fn dealloc(&self, pointer: *mut u8, layout: Layout) {
-        // SAFETY: the caller keeps the contract of `dealloc`.
-        unsafe { System.dealloc(pointer, layout) }
-    }
-}
 
 #[global_allocator]
 static COUNTING: Counting = Counting;
@@ -78,12 +56,13 @@ fn logging_and_snapshots_allocate_nothing_in_the_loop_s_thread() {
             episodes: &[],
             running: EpisodeResult::start(&observation),
         };
-        let before = ALLOCATIONS.get();
-        logger.ticked(&tick);
-        snapshots.ticked(&tick);
-        assert_eq!(ALLOCATIONS.get(), before, "step {step}");
+        let (count, ()) = allocations(|| {
+            logger.ticked(&tick);
+            snapshots.ticked(&tick);
+        });
+        assert_eq!(count, 0, "step {step}");
     }
-    assert!(ALLOCATIONS.get() > 1000, "allocations are counted");
+    assert_eq!(allocations(|| drop(std::hint::black_box(Box::new(1_u8)))).0, 1, "allocations are counted");
     let summary = logger.finish().unwrap();
     snapshots.finish().unwrap();
     assert_eq!(summary.ticks + summary.dropped, 300);
