@@ -75,8 +75,7 @@ pub(super) struct RunArguments {
 pub(super) fn run(arguments: &RunArguments) -> anyhow::Result<()> {
     let stop = super::stop_flag()?;
     let bundle = super::open_bundle(&arguments.bundle)?;
-    let engine =
-        EngineSettings::of(arguments.engine, arguments.threads).with_half_weights(arguments.half_weights);
+    let engine = EngineSettings::chosen(arguments.engine, arguments.threads, arguments.half_weights)?;
     let sampling = match arguments.sample {
         true => Sampling::Sample { seed: arguments.seed },
         false => Sampling::Mode,

@@ -85,14 +85,30 @@ impl EngineSettings {
         Self { kind, threads: 1, form }
     }
 
-    /// An engine as it is deployed, perhaps with another number of threads.
-    #[must_use]
-    pub fn of(kind: EngineKind, threads: Option<u16>) -> Self {
-        let usual = match kind {
-            EngineKind::Tract => Self::tract(),
-            EngineKind::Ort => Self::ort(1),
+    /// An engine as it is deployed, with what was chosen on a command line.
+    ///
+    /// # Errors
+    /// [`EngineError::Choice`] for what the engine does not have.
+    pub fn chosen(kind: EngineKind, threads: Option<u16>, half_weights: bool) -> Result<Self, EngineError> {
+        let refuse =
+            |what: String, instead: &str| Err(EngineError::Choice { what, instead: instead.to_owned() });
+        let usual = match (kind, threads) {
+            (EngineKind::Tract, Some(threads @ 3..)) => {
+                return refuse(
+                    format!("--threads {threads} with engine tract"),
+                    "its tick runs on 1 or 2 threads",
+                );
+            }
+            (EngineKind::Ort, _) if half_weights => {
+                return refuse(
+                    "--half-weights with engine ort".into(),
+                    "only tract keeps weights in 16 bits",
+                );
+            }
+            (EngineKind::Tract, _) => Self::tract().with_half_weights(half_weights),
+            (EngineKind::Ort, _) => Self::ort(1),
         };
-        threads.map_or(usual, |threads| usual.with_threads(threads.into()))
+        Ok(threads.map_or(usual, |threads| usual.with_threads(threads.into())))
     }
 
     /// With another number of threads.
@@ -143,6 +159,14 @@ pub enum EngineError {
     /// The program was built without it.
     #[error("engine ort: this program was built without the feature `ort`; use --engine tract")]
     OrtNotBuilt,
+    /// A choice that the engine does not have.
+    #[error("{what}: {instead}")]
+    Choice {
+        /// What was chosen.
+        what: String,
+        /// What there is.
+        instead: String,
+    },
     /// The bundle does not have the part.
     #[error("the bundle has no {part}")]
     NoPart {
