@@ -4,9 +4,13 @@
 
 mod support;
 
+use std::process::Stdio;
+use std::time::Duration;
+
 use assert_cmd::Command;
 use rcwm_models::files::sha256_hex;
 use rcwm_models::tensors::{Tensors, Values};
+use rustix::process::{Pid, Signal, kill_process};
 use support::{observation, own_link, smallest_bundle, with_manifest};
 
 fn runtime() -> Command {
@@ -130,7 +134,7 @@ fn a_peer_that_falls_silent_ends_the_run_with_its_own_exit_code_and_what_was_gra
     let answering = std::thread::spawn(move || error_of(&mut command, 5));
     // The controller says hello: it missed the first one.
     while !peer.poll_events().unwrap().hello {
-        std::thread::sleep(std::time::Duration::from_millis(5));
+        std::thread::sleep(Duration::from_millis(5));
     }
     peer.publish(|slot| *slot = observation(0, 0)).unwrap();
     let error = answering.join().unwrap();
@@ -172,4 +176,42 @@ fn inspect_counts_every_part_once() {
     let sum: u64 = in_tick.map(|part| part["parameters"].as_u64().unwrap()).sum();
     assert_eq!(info["tick"]["parameters"].as_u64().unwrap(), sum);
     assert!(sum > 0 && info["tick"]["flops"].as_u64().unwrap() > 0);
+}
+
+#[test]
+fn what_an_engine_does_not_have_is_said_and_not_passed_over() {
+    let refused = |options: &[&str]| {
+        let mut command = runtime();
+        command.args(["run", "--instance", "none", "--bundle"]).arg(smallest_bundle()).args(options);
+        error_of(&mut command, 1)
+    };
+    assert!(refused(&["--threads", "5"]).contains("1 or 2 threads"));
+    assert!(refused(&["--engine", "ort", "--half-weights"]).contains("only tract"));
+}
+
+/// A supervisor signals the process, then its group: the run still ends in order.
+#[test]
+fn two_signals_at_once_are_one() {
+    let link = own_link();
+    let peer = link.peer();
+    let mut command = std::process::Command::new(env!("CARGO_BIN_EXE_rcwm-runtime"));
+    command.env("RCWM_PREFIX", link.prefix()).args([
+        "run",
+        "--instance",
+        "test",
+        "--timeout",
+        "0",
+        "--bundle",
+    ]);
+    command.arg(smallest_bundle()).stdout(Stdio::null()).stderr(Stdio::null());
+    let mut run = command.spawn().unwrap();
+    while !peer.poll_events().unwrap().hello {
+        std::thread::sleep(Duration::from_millis(5));
+    }
+    let id = Pid::from_child(&run);
+    // Stopped, it gets both when it goes on.
+    for signal in [Signal::STOP, Signal::TERM, Signal::INT, Signal::CONT] {
+        kill_process(id, signal).unwrap();
+    }
+    assert_eq!(run.wait().unwrap().code(), Some(0));
 }

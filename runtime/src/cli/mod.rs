@@ -23,6 +23,7 @@ use std::path::{Path, PathBuf};
 use std::process::ExitCode;
 use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, Ordering};
+use std::time::{Duration, Instant};
 
 use anyhow::Context;
 use clap::{Parser, Subcommand, ValueEnum};
@@ -181,12 +182,17 @@ fn write_json(path: Option<&PathBuf>, report: &impl Serialize) -> anyhow::Result
     Ok(())
 }
 
-/// A flag that Ctrl-C or SIGTERM sets; a second one ends the process at once.
+/// Signals this close together are one: supervisors and `timeout` signal a process, then its whole group.
+const ONE_SIGNAL: Duration = Duration::from_millis(300);
+
+/// A flag that Ctrl-C or SIGTERM sets; a second one, later, ends the process at once.
 fn stop_flag() -> anyhow::Result<Arc<AtomicBool>> {
     let stop = Arc::new(AtomicBool::new(false));
     let flag = Arc::clone(&stop);
+    let mut first: Option<Instant> = None;
     ctrlc::set_handler(move || {
-        if flag.swap(true, Ordering::Relaxed) {
+        flag.store(true, Ordering::Relaxed);
+        if first.get_or_insert_with(Instant::now).elapsed() > ONE_SIGNAL {
             std::process::exit(i32::from(Exit::AtOnce as u8));
         }
     })
