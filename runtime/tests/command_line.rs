@@ -189,6 +189,27 @@ fn what_an_engine_does_not_have_is_said_and_not_passed_over() {
     assert!(refused(&["--engine", "ort", "--half-weights"]).contains("only tract"));
 }
 
+#[test]
+fn what_cannot_be_written_hides_neither_how_the_run_ended_nor_what_else_failed() {
+    let link = own_link();
+    let peer = link.peer();
+    let mut command = runtime();
+    command.env("RCWM_PREFIX", link.prefix());
+    command.args(["run", "--instance", "test", "--silence-max", "0.3", "--json", "/dev/null/a.json"]);
+    command.args(["--plot", "/dev/null/a.png", "--bundle"]).arg(smallest_bundle());
+    let answering = std::thread::spawn(move || command.assert().code(5).get_output().clone());
+    while !peer.poll_events().unwrap().hello {
+        std::thread::sleep(Duration::from_millis(5));
+    }
+    peer.publish(|slot| *slot = observation(0, 0)).unwrap();
+    let text = String::from_utf8(answering.join().unwrap().stderr).unwrap();
+    let errors: Vec<_> = text.lines().filter(|line| line.starts_with("error: ")).collect();
+    assert_eq!(errors.len(), 3, "{text}");
+    for part in ["has been silent", "/dev/null: ", "a.png"] {
+        assert!(errors.iter().any(|error| error.contains(part)), "{part}: {text}");
+    }
+}
+
 /// A supervisor signals the process, then its group: the run still ends in order.
 #[test]
 fn two_signals_at_once_are_one() {

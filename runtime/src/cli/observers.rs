@@ -108,17 +108,25 @@ impl Observers {
         self.recorder.as_ref().map_or(0, Recorder::dropped)
     }
 
-    /// Waits until everything is written; the first error is told after all have ended.
-    pub(super) fn finish(self) -> anyhow::Result<Left> {
+    /// Waits until everything is written. What could not be written keeps nothing else from being told.
+    pub(super) fn finish(self) -> (Left, Vec<anyhow::Error>) {
         let bar = indicatif::ProgressBar::new_spinner().with_message("writing what was recorded");
         bar.enable_steady_tick(Duration::from_millis(200));
-        let log = self.logger.map(Logger::finish).transpose();
-        let snapshots = self.snapshots.map(Snapshots::finish).transpose();
-        let recorded = self.recorder.map_or_else(|| Ok(Recorded::default()), Recorder::finish);
+        let mut failures = Vec::new();
+        let log = self.logger.and_then(|logger| note(logger.finish(), &mut failures));
+        self.snapshots.and_then(|snapshots| note(snapshots.finish(), &mut failures));
+        let recorded = self.recorder.and_then(|recorder| note(recorder.finish(), &mut failures));
         bar.finish_and_clear();
-        snapshots?;
-        Ok(Left { log: log?, recorded: recorded? })
+        (Left { log, recorded: recorded.unwrap_or_default() }, failures)
     }
+}
+
+/// The value; an error is put to the others.
+pub(super) fn note<T, E: Into<anyhow::Error>>(
+    result: Result<T, E>,
+    failures: &mut Vec<anyhow::Error>,
+) -> Option<T> {
+    result.map_err(|error| failures.push(error.into())).ok()
 }
 
 impl Left {

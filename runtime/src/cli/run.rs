@@ -8,7 +8,7 @@ use anyhow::Context;
 use clap::Args;
 use rcwm_models::wire::LinkSettings;
 
-use super::observers::{Left, ObserverArguments, Observers};
+use super::observers::{ObserverArguments, Observers, note};
 use super::safety::{SafetyArguments, TimeArguments};
 use super::status::StatusLine;
 use crate::controller::{Controller, ControllerError, ControllerSettings, Ended, TickObserver};
@@ -106,16 +106,25 @@ pub(super) fn run(arguments: &RunArguments) -> anyhow::Result<()> {
     // The simulator is told before anything slow is done.
     let closed = controller.close();
     report.frames_dropped = observers.frames_dropped();
-    let left = observers.finish();
-    if report.counters.observations > 0 || result.is_ok() {
+    let (left, unwritten) = observers.finish();
+    // How the run ended comes first: it decides the exit code.
+    let mut failures = Vec::new();
+    let ran = note(result, &mut failures).is_some();
+    failures.extend(unwritten);
+    if report.counters.observations > 0 || ran {
         print!("{}", report.summary());
-        super::write_json(arguments.json.as_ref(), &report)?;
+        note(super::write_json(arguments.json.as_ref(), &report), &mut failures);
     }
-    print!("{}", left.as_ref().map(Left::lines).unwrap_or_default());
-    print!("{}", arguments.observers.write_latencies(&telemetry, &report)?);
-    result?;
-    left?;
-    Ok(closed?)
+    print!("{}", left.lines());
+    let written = note(arguments.observers.write_latencies(&telemetry, &report), &mut failures);
+    print!("{}", written.unwrap_or_default());
+    note(closed, &mut failures);
+    let mut failures = failures.into_iter();
+    let first = failures.next();
+    for other in failures {
+        eprintln!("error: {}", super::one_line(other.as_ref()));
+    }
+    first.map_or(Ok(()), Err)
 }
 
 impl RunArguments {
