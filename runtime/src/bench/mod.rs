@@ -23,6 +23,9 @@ use crate::policy::{Policy, PolicyError, Sampling};
 use crate::realtime;
 use crate::telemetry::{Curve, LatencyFiles, PlotError, Stage, Telemetry, plot};
 
+/// Most ticks of the warm-up.
+const WARM_UP_MAX: usize = 2000;
+
 /// Why nothing could be measured.
 #[derive(Debug, thiserror::Error)]
 pub enum BenchError {
@@ -41,6 +44,9 @@ pub enum BenchError {
     /// The parts could not be taken apart.
     #[error(transparent)]
     Compile(#[from] CompileError),
+    /// It was ended before the warm-up was over.
+    #[error("stopped before a tick was measured: give it more time, or fewer --ticks")]
+    Stopped,
     /// The machine's limits could not be measured.
     #[error("measuring the machine: {0}")]
     Machine(String),
@@ -53,7 +59,7 @@ struct Runner {
     executed: Option<[f32; ACTION_LEN]>,
 }
 
-/// Runs every case for `ticks` ticks after a tenth of them unmeasured. With `real_time`, the calling thread and the ticks' second
+/// Runs every case for `ticks` ticks after a tenth of them, at most 2000, unmeasured. With `real_time`, the calling thread and the ticks' second
 /// threads get a fixed priority and the process locked memory, as far as the system grants it. `go_on` is asked after every round.
 ///
 /// # Errors
@@ -81,7 +87,7 @@ pub fn bench(
     let images = images.as_slice().filter(|_| count > 0);
     let images = images.ok_or(TensorsError::Missing { name: "input/image, at least one tick".into() })?;
     let image_len = images.len() / count;
-    let warm_up = ticks / 10;
+    let warm_up = (ticks / 10).min(WARM_UP_MAX);
     let mut measured = 0;
     let mut rested = Instant::now();
     for round in 0..warm_up + ticks {
@@ -99,6 +105,9 @@ pub fn bench(
         if !go_on() {
             break;
         }
+    }
+    if measured == 0 {
+        return Err(BenchError::Stopped);
     }
     let runs: Vec<(Case, Telemetry)> =
         runners.into_iter().map(|runner| (runner.case, runner.telemetry)).collect();
