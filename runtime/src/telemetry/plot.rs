@@ -13,6 +13,8 @@ use plotters::style::register_font;
 use plotters::style::text_anchor::{HPos, Pos, VPos};
 use rcwm_models::files::FileError;
 
+use super::Stage;
+
 /// DejaVu Sans, the glyphs that are used; its licence lies beside it.
 const FONT: &[u8] = include_bytes!("DejaVuSans-subset.ttf");
 const FAMILY: &str = "sans-serif";
@@ -24,8 +26,8 @@ const NAMES_WIDTH: u32 = 190;
 const NAME_HEIGHT: i32 = 20;
 /// Points between one power of two of `1 / (1 - percentile)` and the next.
 const TICKS_PER_HALF_DISTANCE: u32 = 8;
-/// Colours that are told apart also by those who see no red or green (after Okabe and Ito), and two greys.
-const COLOURS: [RGBColor; 9] = [
+/// One colour a stage: those that are told apart also by those who see no red or green (after Okabe and Ito), then others.
+const COLOURS: [RGBColor; Stage::ALL.len()] = [
     RGBColor(0, 114, 178),
     RGBColor(213, 94, 0),
     RGBColor(0, 158, 115),
@@ -35,6 +37,9 @@ const COLOURS: [RGBColor; 9] = [
     RGBColor(120, 120, 120),
     RGBColor(0, 0, 0),
     RGBColor(180, 170, 60),
+    RGBColor(106, 61, 154),
+    RGBColor(136, 34, 60),
+    RGBColor(0, 84, 72),
 ];
 
 /// Why latencies could not be written.
