@@ -6,9 +6,12 @@ BUNDLE ?= models/bundles/untrained
 TASK ?= button-press
 EPISODES ?= 2
 OUT ?= runs/demo
+PRETRAINED ?= models/small
+DEMONSTRATIONS ?= 50
+LEARNT ?= runs/learn/$(TASK)
 BIN = $${CARGO_TARGET_DIR:-target}/release
 
-.PHONY: help demo test lint clean
+.PHONY: help demo learn test lint clean
 
 help: ## What there is
 	@grep -hE '^[a-z-]+:.*##' $(MAKEFILE_LIST) | sed -E 's/:.*## /\t/' | expand -t 10
@@ -17,6 +20,11 @@ demo: ## Simulator and controller over shared memory: summary and a film in runs
 	@scripts/setup demo
 	$(CARGO) build --release --locked -p rcwm-simulator -p rcwm-runtime
 	@scripts/demo "$(BUNDLE)" "$(TASK)" "$(EPISODES)" "$(OUT)"
+
+learn: ## A new task (TASK=coffee-pull) from 50 demonstrations, deployed and scored: policy, film and figures in runs/learn/TASK
+	@scripts/setup demo
+	$(CARGO) build --release --locked -p rcwm-simulator -p rcwm-runtime -p rcwm-trainer
+	@scripts/learn "$(TASK)" "$(PRETRAINED)" "$(LEARNT)" "$(DEMONSTRATIONS)" 50
 
 test: ## Everything that can be tested on one machine
 	@scripts/setup test

@@ -10,8 +10,9 @@ use rand_chacha::ChaCha8Rng;
 use rcwm_models::settings::{ModelKind, ModelSettings, Preset};
 use rcwm_models::{ACTION_LEN, IMAGE_BYTES, MASK_BYTES};
 use rcwm_trainer::behaviour::{BehaviourLearner, BehaviourSettings, Horizon};
+use rcwm_trainer::cloning::CloningLoss;
 use rcwm_trainer::learning::{
-    Batch, Gradients, HostBatch, Side, Trained, WorldLearner, WorldSettings, side_of,
+    Batch, Gradients, HostBatch, Imitation, Side, Trained, WorldLearner, WorldSettings, side_of,
 };
 use rcwm_trainer::model::agent;
 use rcwm_trainer::model::latent::Sampler;
@@ -31,6 +32,9 @@ fn one_update_of_the_authors_implementation_is_ours_in_every_number() {
     }
     assert!(report.unchecked.is_empty(), "{:?}", report.unchecked);
 }
+
+/// The actor learns with the world model.
+const IMITATION: Imitation = Imitation { scale: 10.0, loss: CloningLoss::SquaredError, learning_rate: 1e-3 };
 
 /// Parameters away from their start, where the layers that begin at 0 let gradients through.
 fn lively_parameters(model: &ModelSettings) -> Parameters {
@@ -63,6 +67,8 @@ fn batch(rows: usize, length: usize, masks: bool) -> Batch {
         terminal: (0..steps).map(|step| step == 1).collect(),
         first,
         robot_mask,
+        pushed: vec![false; steps],
+        number: 0,
     };
     host.into_tensors(&Device::Cpu).unwrap()
 }
@@ -101,12 +107,20 @@ fn assert_gradients_in_every_phase(preset: Preset, kind: ModelKind, rows: usize)
         phases.truncate(2);
     }
     let mut start = None;
+    let mut learner = WorldLearner::new(&parameters, &model, &settings, Trained::World).unwrap();
     for (phase, masks, trained) in phases {
-        let learner = WorldLearner::new(&parameters, &model, &settings, trained).unwrap();
+        learner.train(trained, None).unwrap();
         let losses = learner.losses(&batch(rows, 3, masks), &mut Sampler::seeded(4)).unwrap();
         assert_eq!(losses.robot_mask.is_some(), masks);
         assert_gradients(phase, &losses.total, &parameters, trained);
         start = Some(losses.observed.posteriors.map(|x| x.detach().flatten(0, 1)).unwrap());
+    }
+    for trained in [Trained::WorldAndActor, Trained::EnvironmentAndActor] {
+        if kind == ModelKind::Rcwm || trained == Trained::WorldAndActor {
+            learner.train(trained, Some(IMITATION)).unwrap();
+            let losses = learner.losses(&batch(rows, 3, false), &mut Sampler::seeded(4)).unwrap();
+            assert_gradients("imitation", &losses.total, &parameters, trained);
+        }
     }
     let settings = BehaviourSettings {
         horizon: Horizon { length: 3, ..Horizon::default() },
@@ -241,4 +255,59 @@ fn a_loss_that_is_not_finite_leaves_the_parameters_as_they_were() {
     let error = learner.update(&batch, &mut Sampler::seeded(1)).unwrap_err();
     assert!(error.to_string().contains("resume from the last checkpoint"), "{error}");
     assert_eq!(values(&parameters), before);
+}
+
+#[test]
+fn what_is_imitated_reaches_posteriors_and_encoders() {
+    let model = ModelSettings::preset(Preset::Debug, ModelKind::Rcwm);
+    let parameters = lively_parameters(&model);
+    // Nothing but the imitation is left of the loss.
+    let settings = WorldSettings {
+        image_scale: 0.0,
+        reward_scale: 0.0,
+        continue_scale: 0.0,
+        dynamics_scale: 0.0,
+        representation_scale: 0.0,
+        ..WorldSettings::default()
+    };
+    let mut learner = WorldLearner::new(&parameters, &model, &settings, Trained::World).unwrap();
+    learner.train(Trained::WorldAndActor, Some(IMITATION)).unwrap();
+    let batch = batch(2, 3, false);
+    let losses = learner.losses(&batch, &mut Sampler::seeded(4)).unwrap();
+    let (total, cloning) =
+        (losses.total.to_scalar::<f32>().unwrap(), losses.values().unwrap().cloning.unwrap());
+    assert!((f64::from(total) - IMITATION.scale * cloning).abs() < 1e-5 * cloning, "{total} {cloning}");
+    let gradients = losses.total.backward().unwrap();
+    for name in [
+        "actor.out.weight",
+        "robot.posterior.logits.weight",
+        "environment.posterior.logits.weight",
+        "encoder.environment.0.conv.weight",
+        "encoder.shared.0.conv.weight",
+    ] {
+        let gradient = gradients.get(parameters.get(name).unwrap()).unwrap();
+        let size = gradient.abs().unwrap().sum_all().unwrap().to_scalar::<f32>().unwrap();
+        assert!(size > 0.0 && size.is_finite(), "{name}: {size}");
+    }
+}
+
+#[test]
+fn steps_that_are_painted_take_turns_and_cover_all() {
+    let model = ModelSettings::preset(Preset::Debug, ModelKind::Rcwm);
+    let parameters = lively_parameters(&model);
+    let image = |every: usize, number: u64| {
+        let settings = WorldSettings { paint_every: every, ..WorldSettings::default() };
+        let learner = WorldLearner::new(&parameters, &model, &settings, Trained::World).unwrap();
+        let batch = Batch { number, ..batch(2, 6, true) };
+        let losses = learner.losses(&batch, &mut Sampler::seeded(4)).unwrap().values().unwrap();
+        [losses.image, losses.robot_mask.unwrap()]
+    };
+    for every in [2, 3] {
+        let turns: Vec<_> = (0..every as u64).map(|number| image(every, 5 + number)).collect();
+        for (which, whole) in image(1, 5).into_iter().enumerate() {
+            let mean = turns.iter().map(|losses| losses[which]).sum::<f64>() / every as f64;
+            assert!((mean - whole).abs() < 1e-4 * whole, "{every}: {mean} {whole}");
+            assert!((turns[0][which] - whole).abs() > 1e-4 * whole, "{every}: the turns are all alike");
+        }
+    }
 }

@@ -13,18 +13,19 @@ use candle_core::{Device, Tensor};
 use ndarray::{Array1, Array2, Array4};
 use rand::{Rng, SeedableRng};
 use rand_chacha::ChaCha8Rng;
+use rcwm_models::IMAGE_BYTES;
 use rcwm_models::episode::Episode;
 use rcwm_models::settings::{ModelKind, Preset};
 use rcwm_trainer::behaviour::BehaviourSettings;
 use rcwm_trainer::checkpoint::Checkpoint;
 use rcwm_trainer::cloning::{CloningLearner, CloningLoss, CloningSettings, Examples, Ramp, actions_taken};
-use rcwm_trainer::learning::{Side, side_of};
+use rcwm_trainer::learning::{HostBatch, Side, side_of};
 use rcwm_trainer::model::latent::Sampler;
 use rcwm_trainer::model::parameters::Parameters;
-use rcwm_trainer::replay::Replay;
+use rcwm_trainer::replay::{Replay, Starts};
 use rcwm_trainer::training::{
-    Fewshot, Outcome, Phase, Pretraining, Reset, ResetSettings, Run, Stage, TrainingError, TrainingSettings,
-    demonstrations, start_from,
+    Fewshot, FewshotSettings, Outcome, Phase, Pretraining, Reset, ResetSettings, Run, Stage, TrainingError,
+    TrainingSettings, demonstrations, start_from,
 };
 
 /// A bright square that moves with the action, to and fro.
@@ -164,13 +165,22 @@ fn updates_logged(folder: &Path) -> Vec<u64> {
 
 #[test]
 fn few_shot_learning_that_was_interrupted_in_any_stage_gives_the_same_weights() {
-    for (kind, world_goes_on) in
-        [(ModelKind::Rcwm, false), (ModelKind::Rcwm, true), (ModelKind::Vanilla, false)]
-    {
+    for (kind, world_goes_on, imitates) in [
+        (ModelKind::Rcwm, false, false),
+        (ModelKind::Rcwm, true, false),
+        (ModelKind::Rcwm, false, true),
+        (ModelKind::Vanilla, false, true),
+    ] {
         let folder = tempfile::tempdir().unwrap();
         let (whole, parts) = (folder.path().join("whole"), folder.path().join("parts"));
         let mut settings = settings(kind);
         settings.fewshot.world_goes_on = world_goes_on;
+        if imitates {
+            settings.fewshot.imitation_scale = 10.0;
+            settings.fewshot.starts = Starts::Episodes;
+            settings.fewshot.shift = 2;
+            settings.world.paint_every = 2;
+        }
         let source = pretrained(kind);
         let mut learning = Fewshot::create(&whole, settings.clone(), &source, &Device::Cpu).unwrap();
         assert_eq!(learn(&mut learning, u64::MAX), Outcome { updates: 20, interrupted: false });
@@ -183,7 +193,10 @@ fn few_shot_learning_that_was_interrupted_in_any_stage_gives_the_same_weights() 
             assert_eq!(learning.updates(), stop.min(20));
             learning = Fewshot::resume(&parts, Run::settings(&parts).unwrap(), &Device::Cpu).unwrap();
         }
-        assert!(bits(learning.parameters()) == expected, "{kind:?}, {world_goes_on}: not the same bits");
+        assert!(
+            bits(learning.parameters()) == expected,
+            "{kind:?}, {world_goes_on}, {imitates}: not the same bits"
+        );
         assert_eq!(updates_logged(&parts), updates_logged(&whole));
     }
 }
@@ -280,11 +293,23 @@ fn the_action_of_a_state_is_the_one_that_led_to_the_next_image() {
     }
     // In a batch that runs on into another episode the last state of the first has no action.
     let features = Tensor::arange(0f32, 6.0, &Device::Cpu).unwrap().reshape((2, 3, 1)).unwrap();
-    let actions = (&features * 0.1).unwrap();
     let first = [true, false, true, false, false, false];
-    let (features, actions) = Examples::of_batch(&features, &actions, &first).unwrap();
-    assert_eq!(features.flatten_all().unwrap().to_vec1::<f32>().unwrap(), [0.0, 3.0, 4.0]);
-    assert_eq!(actions.flatten_all().unwrap().to_vec1::<f32>().unwrap(), [0.1, 0.4, 0.5]);
+    let batch = HostBatch {
+        rows: 2,
+        length: 3,
+        image: vec![0; 6 * IMAGE_BYTES],
+        action: (0..24).map(|x| 0.01 * (x / 4) as f32).collect(),
+        reward: vec![0.0; 6],
+        terminal: vec![false; 6],
+        first: first.to_vec(),
+        // And what was a push is no example.
+        pushed: vec![false, false, false, false, true, false],
+        ..HostBatch::default()
+    };
+    let batch = batch.into_tensors(&Device::Cpu).unwrap();
+    let (features, actions) = Examples::of_batch(&features, &batch).unwrap();
+    assert_eq!(features.flatten_all().unwrap().to_vec1::<f32>().unwrap(), [0.0, 4.0]);
+    assert_eq!(actions.to_vec2::<f32>().unwrap(), [[0.01; 4], [0.05; 4]]);
 }
 
 #[test]
@@ -302,16 +327,24 @@ fn only_successful_episodes_of_the_task_are_demonstrations() {
         episode(steps, 0, success).write(&path).unwrap();
     }
     let found = |task: &str, count| {
-        let replay = demonstrations(folder.path(), task, count, 1000, || ()).unwrap();
+        let settings = FewshotSettings { demonstrations: count, ..FewshotSettings::default() };
+        let replay = demonstrations(folder.path(), task, &settings, 1000, || ()).unwrap();
         let lengths = replay.tasks().flat_map(|(_, episodes)| episodes.into_iter().map(|e| e.len()));
         lengths.collect::<Vec<_>>()
     };
     assert_eq!(found("hammer", 2), [5, 6]);
+    // Two steps after the success, which is at the last step but one.
+    let settings = FewshotSettings { steps_after_success: 0, ..FewshotSettings::default() };
+    let replay = demonstrations(folder.path(), "reach", &settings, 1000, || ()).unwrap();
+    let (_, episodes) = replay.tasks().next().unwrap();
+    assert!(
+        episodes[0].len() <= 8 && episodes[0].success.iter().position(|s| *s) == Some(episodes[0].len() - 1)
+    );
     assert_eq!(found("", 9), [5, 6, 7, 8]);
     fs::remove_dir_all(folder.path().join("reach")).unwrap();
     for name in ["b", "c", "d"] {
         fs::remove_file(folder.path().join("hammer").join(name).with_extension("npz")).unwrap();
     }
-    let none = demonstrations(folder.path(), "hammer", 2, 1000, || ());
+    let none = demonstrations(folder.path(), "hammer", &FewshotSettings::default(), 1000, || ());
     assert!(matches!(none, Err(TrainingError::NoDemonstrations { episodes: 1, .. })));
 }

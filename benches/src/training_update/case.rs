@@ -167,7 +167,8 @@ fn batch(Scale { batch, length, .. }: Scale) -> Result<Batch> {
         reward: (0..steps).map(|i| (i % 11) as f32).collect(),
         terminal: vec![false; steps],
         first: (0..steps).map(|i| i % (length + 5) == 11).collect(),
-        robot_mask: Vec::new(),
+        pushed: vec![false; steps],
+        ..HostBatch::default()
     };
     Ok(host.into_tensors(&Device::Cpu)?)
 }

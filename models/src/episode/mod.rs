@@ -13,7 +13,7 @@ mod npz;
 
 use std::path::{Path, PathBuf};
 
-use ndarray::{Array1, Array2, Array3, Array4};
+use ndarray::{Array1, Array2, Array3, Array4, Axis, Slice};
 
 use crate::files::{FileError, read_capped, write_atomic};
 use crate::wire::{Observation, ObservationFlags};
@@ -41,6 +41,8 @@ pub struct Episode {
     pub is_terminal: Array1<bool>,
     /// [T].
     pub success: Array1<bool>,
+    /// [T], true where the action was a push off course and no example of what to do.
+    pub pushed: Array1<bool>,
     /// [T, 64, 64], true where the robot is.
     pub robot_mask: Option<Array3<bool>>,
     /// [T, 18].
@@ -100,7 +102,8 @@ impl Episode {
             is_first: (0..steps).map(|step| step == 0).collect(),
             is_last: no.clone(),
             is_terminal: no.clone(),
-            success: no,
+            success: no.clone(),
+            pushed: no,
             robot_mask: None,
             proprio: None,
         }
@@ -128,6 +131,24 @@ impl Episode {
     #[must_use]
     pub fn succeeded(&self) -> bool {
         self.success.iter().any(|success| *success)
+    }
+
+    /// The first `steps` steps, or all if there are no more.
+    #[must_use]
+    pub fn shortened(&self, steps: usize) -> Self {
+        let range = Slice::from(..steps.min(self.len()));
+        Self {
+            image: self.image.slice_axis(Axis(0), range).to_owned(),
+            action: self.action.slice_axis(Axis(0), range).to_owned(),
+            reward: self.reward.slice_axis(Axis(0), range).to_owned(),
+            is_first: self.is_first.slice_axis(Axis(0), range).to_owned(),
+            is_last: self.is_last.slice_axis(Axis(0), range).to_owned(),
+            is_terminal: self.is_terminal.slice_axis(Axis(0), range).to_owned(),
+            success: self.success.slice_axis(Axis(0), range).to_owned(),
+            pushed: self.pushed.slice_axis(Axis(0), range).to_owned(),
+            robot_mask: self.robot_mask.as_ref().map(|mask| mask.slice_axis(Axis(0), range).to_owned()),
+            proprio: self.proprio.as_ref().map(|proprio| proprio.slice_axis(Axis(0), range).to_owned()),
+        }
     }
 
     /// Reads a `.npz` file; every array's size is checked before it is unpacked.
@@ -230,6 +251,7 @@ impl EpisodeBuilder {
             is_last: bits(ObservationFlags::LAST),
             is_terminal: bits(ObservationFlags::TERMINAL),
             success: bits(ObservationFlags::SUCCESS),
+            pushed: bits(ObservationFlags::PUSHED),
             is_first,
             image: Array4::from_shape_vec((steps, IMAGE_SIDE, IMAGE_SIDE, IMAGE_CHANNELS), this.image)
                 .expect(fits),

@@ -117,6 +117,7 @@ pub(super) fn read(path: &Path, bytes: &[u8]) -> Result<Episode, EpisodeError> {
     let is_terminal = reader.flags("is_terminal", steps)?.unwrap_or_else(none);
     let is_last = reader.flags("is_last", steps)?.unwrap_or_else(none);
     let success = reader.flags("success", steps)?.unwrap_or_else(none);
+    let pushed = reader.flags("pushed", steps)?.unwrap_or_else(none);
     let robot_mask = match reader.unpack("robot_mask")? {
         None => None,
         Some(bytes) => {
@@ -134,7 +135,18 @@ pub(super) fn read(path: &Path, bytes: &[u8]) -> Result<Episode, EpisodeError> {
             Some(reader.shaped::<_, Ix2>("proprio", array, &[steps, PROPRIOCEPTION_LEN])?)
         }
     };
-    Ok(Episode { image, action, reward, is_first, is_last, is_terminal, success, robot_mask, proprio })
+    Ok(Episode {
+        image,
+        action,
+        reward,
+        is_first,
+        is_last,
+        is_terminal,
+        success,
+        pushed,
+        robot_mask,
+        proprio,
+    })
 }
 
 fn read_images(reader: &mut Reader<'_>) -> Result<Array4<u8>, EpisodeError> {
@@ -165,6 +177,9 @@ pub(super) fn to_bytes(episode: &Episode) -> Result<Vec<u8>, String> {
         ("success", &episode.success),
     ] {
         add(&mut zip, key, flags)?;
+    }
+    if episode.pushed.iter().any(|pushed| *pushed) {
+        add(&mut zip, "pushed", &episode.pushed)?;
     }
     if let Some(mask) = &episode.robot_mask {
         let with_channel = mask.mapv(u8::from).insert_axis(ndarray::Axis(3));

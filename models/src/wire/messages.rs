@@ -23,6 +23,8 @@ impl ObservationFlags {
     pub const ACTION_HELD: Self = Self(1 << 5);
     /// The same observation (same sequence) was published before; it is sent again for a new or silent controller.
     pub const REPEATED: Self = Self(1 << 6);
+    /// The executed action was a push off course, made to show how to recover: no example of what to do.
+    pub const PUSHED: Self = Self(1 << 7);
 
     /// Whether all bits of `other` are set.
     #[must_use]

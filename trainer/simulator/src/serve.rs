@@ -68,6 +68,7 @@ struct Place {
     step: u32,
     executed: [f32; ACTION_LEN],
     held: bool,
+    pushed: bool,
     scheduled_ns: u64,
     /// When it was published for the first time.
     published_ns: u64,
@@ -164,6 +165,7 @@ impl Server<'_> {
             let due_ns = clock.as_ref().map_or_else(monotonic_ns, Schedule::next_ns);
             let action =
                 if self.settings.policy.is_scripted() { script.decide(self.environment)? } else { answer };
+            self.place.pushed = script.pushed();
             self.execute(action)?;
             self.publish_new(due_ns, &mut sum, &mut solved)?;
             if let Some(clock) = &mut clock {
@@ -229,7 +231,7 @@ impl Server<'_> {
     }
 
     fn fill(&self, observation: &mut Observation, solved: bool, repeated: bool) {
-        let Place { sequence, episode, step, executed, held, scheduled_ns, .. } = self.place;
+        let Place { sequence, episode, step, executed, held, pushed, scheduled_ns, .. } = self.place;
         observation.sequence = sequence;
         observation.episode = episode;
         observation.step = step;
@@ -249,6 +251,7 @@ impl Server<'_> {
             .with(ObservationFlags::MASK_VALID, self.environment.settings().masks)
             .with(ObservationFlags::ACTION_HELD, held)
             .with(ObservationFlags::REPEATED, repeated)
+            .with(ObservationFlags::PUSHED, pushed)
             .0;
     }
 

@@ -34,6 +34,9 @@ pub struct Collect {
     /// Episodes of each task with random actions
     #[arg(long, default_value_t = 0, value_name = "N")]
     random: u64,
+    /// Episodes of each task by the expert, pushed off course now and then: demonstrations of how to recover
+    #[arg(long, default_value_t = 0, value_name = "N")]
+    pushed: u64,
     /// How many of each task's episodes have robot masks (slower); spread over the three kinds
     #[arg(long, default_value_t = 0, value_name = "N")]
     masks: u64,
@@ -50,7 +53,7 @@ pub struct Collect {
     #[arg(long, default_value = "none", value_parser = ["none", "textures", "noise"])]
     disturb: String,
     /// Record a simulator that runs already; it gets random actions where it waits for a policy
-    #[arg(long, value_name = "INSTANCE", conflicts_with_all = ["tasks", "expert", "mixed", "random", "masks"])]
+    #[arg(long, value_name = "INSTANCE", conflicts_with_all = ["tasks", "expert", "mixed", "pushed", "random", "masks"])]
     join: Option<String>,
     /// Episodes to record with --join
     #[arg(long, default_value_t = 1, value_name = "N", requires = "join")]
@@ -86,9 +89,17 @@ impl Collect {
 
     fn collect(&self, stop: &std::sync::atomic::AtomicBool) -> Result<(Sums, u64)> {
         let tasks = self.tasks()?;
-        let amounts =
-            Amounts { expert: self.expert, mixed: self.mixed, random: self.random, masked: self.masks };
-        ensure!(amounts.total() > 0, "nothing to collect: give --expert, --mixed or --random a number");
+        let amounts = Amounts {
+            expert: self.expert,
+            mixed: self.mixed,
+            random: self.random,
+            pushed: self.pushed,
+            masked: self.masks,
+        };
+        ensure!(
+            amounts.total() > 0,
+            "nothing to collect: give --expert, --mixed, --pushed or --random a number"
+        );
         let cores = std::thread::available_parallelism().map_or(1, std::num::NonZero::get);
         let settings = CollectSettings {
             out: self.out.clone(),

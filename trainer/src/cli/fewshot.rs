@@ -125,11 +125,13 @@ impl Fewshot {
 }
 
 fn load(settings: &TrainingSettings) -> Result<Replay> {
-    let count = settings.fewshot.demonstrations;
-    let bar = ProgressBar::new(count as u64)
+    let fewshot = &settings.fewshot;
+    let bar = ProgressBar::new(fewshot.demonstrations as u64)
         .with_style(ProgressStyle::with_template("loading {wide_bar} {pos}/{len} demonstrations")?);
     let replay =
-        demonstrations(&settings.data, &settings.task, count, settings.replay.capacity_steps, || bar.inc(1))?;
+        demonstrations(&settings.data, &settings.task, fewshot, settings.replay.capacity_steps, || {
+            bar.inc(1)
+        })?;
     bar.finish_and_clear();
     println!("{} demonstrations, {} steps", replay.episodes(), replay.steps());
     Ok(replay)
@@ -140,13 +142,14 @@ fn describe(line: &Line) -> String {
         line.number(name).map_or_else(String::new, |value| format!(" {text} {value:.digits$}"))
     };
     format!(
-        "{} {:.2} updates/s{}{}{}{}{}{}",
+        "{} {:.2} updates/s{}{}{}{}{}{}{}",
         line.phase,
         line.number("updates_per_second").unwrap_or_default(),
         number("waiting_share", "waiting", 2),
         number("losses.image", "image", 1),
         number("losses.reward", "reward", 3),
         number("losses.environment_kl", "kl", 2),
+        number("losses.cloning", "cloning", 4),
         number("cloning.loss", "cloning", 4),
         number("cloning.imagined.lambda_return", "return", 2),
     )

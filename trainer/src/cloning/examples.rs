@@ -7,11 +7,23 @@ use rcwm_models::episode::Episode;
 use rcwm_models::settings::{ModelKind, ModelSettings};
 use rcwm_models::{ACTION_LEN, IMAGE_CHANNELS, IMAGE_SIDE};
 
+use crate::learning::{Batch, Shift};
 use crate::model::agent::Agent;
 use crate::model::latent::{FirstSteps, Latent, Sampler, State};
 
 /// Demonstrations that are filtered at a time.
 const EPISODES_AT_ONCE: usize = 10;
+
+/// How often and how demonstrations are filtered.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub struct Views {
+    /// Times in all; the first with the most probable classes.
+    pub draws: u64,
+    /// Pixels by which pictures are shifted at most from the second time on.
+    pub shift: usize,
+    /// Draws of classes and shifts depend on this.
+    pub seed: u64,
+}
 
 /// States of demonstrations and the actions taken in them.
 #[derive(Debug, Clone)]
@@ -23,24 +35,23 @@ pub struct Examples {
 }
 
 impl Examples {
-    /// Filters every episode `draws` times: the first time with the most probable classes, then with draws under `seed`. Carries no
-    /// gradient if the agent's parameters do not.
+    /// Filters every episode several times: first as it is with the most probable classes, then shifted and with draws. Carries no gradient
+    /// if the agent's parameters do not.
     ///
     /// # Errors
     /// Those of candle, also if no episode has two steps.
-    pub fn filter(
-        agent: &Agent,
-        episodes: &[Arc<Episode>],
-        draws: u64,
-        seed: u64,
-        device: &Device,
-    ) -> Result<Self> {
+    pub fn filter(agent: &Agent, episodes: &[Arc<Episode>], views: &Views, device: &Device) -> Result<Self> {
         let (mut features, mut actions) = (Vec::new(), Vec::new());
         for (chunk, episodes) in episodes.chunks(EPISODES_AT_ONCE).enumerate() {
-            let padded = Padded::new(agent, episodes, device)?;
-            for draw in 0..draws {
-                let number = chunk as u64 * draws + draw;
-                let mut sampler = if draw == 0 { Sampler::Mode } else { Sampler::numbered(seed, number) };
+            let mut padded = Padded::new(agent, episodes, &|_| Shift::default(), device)?;
+            for draw in 0..views.draws {
+                let number = chunk as u64 * views.draws + draw;
+                let mut sampler =
+                    if draw == 0 { Sampler::Mode } else { Sampler::numbered(views.seed, number) };
+                if draw > 0 && views.shift > 0 {
+                    let shift = |row| Shift::drawn(views.shift, views.seed, number, row);
+                    padded = Padded::new(agent, episodes, &shift, device)?;
+                }
                 let posteriors = agent
                     .world
                     .observe(&padded.embeds, &padded.actions, &padded.first, &mut sampler)?
@@ -59,14 +70,15 @@ impl Examples {
         Self { features, actions }
     }
 
-    /// The examples in a batch, from its posterior features [B, T, state width], its actions [B, T, action] and where episodes begin
-    /// in it, by row and step: features [N, state width] and actions [N, action].
+    /// The examples in a batch, from its posterior features [B, T, state width]: features [N, state width] and actions [N, action].
     ///
     /// # Errors
     /// Those of candle, also if there is none.
-    pub fn of_batch(features: &Tensor, actions: &Tensor, first: &[bool]) -> Result<(Tensor, Tensor)> {
+    pub fn of_batch(features: &Tensor, batch: &Batch) -> Result<(Tensor, Tensor)> {
+        let (first, pushed, actions) = (batch.first.flags(), &batch.pushed, &batch.action);
         let length = features.dim(1)?;
-        let goes_on = |index: &usize| !(index + 1).is_multiple_of(length) && !first[index + 1];
+        let goes_on =
+            |index: &usize| !(index + 1).is_multiple_of(length) && !first[index + 1] && !pushed[index + 1];
         let chosen: Vec<u32> = (0..first.len()).filter(goes_on).map(|index| index as u32).collect();
         let next: Vec<u32> = chosen.iter().map(|index| index + 1).collect();
         let pick = |x: &Tensor, indices: Vec<u32>| {
@@ -74,6 +86,12 @@ impl Examples {
             x.flatten(0, 1)?.index_select(&Tensor::from_vec(indices, count, x.device())?, 0)
         };
         Ok((pick(features, chosen)?, pick(actions, next)?.clamp(-1f32, 1f32)?))
+    }
+
+    /// Features [N, state width] and actions [N, action] of all.
+    #[must_use]
+    pub fn all(&self) -> (&Tensor, &Tensor) {
+        (&self.features, &self.actions)
     }
 
     /// N.
@@ -112,13 +130,19 @@ struct Padded {
 }
 
 impl Padded {
-    fn new(agent: &Agent, episodes: &[Arc<Episode>], device: &Device) -> Result<Self> {
+    fn new(
+        agent: &Agent,
+        episodes: &[Arc<Episode>],
+        shift: &dyn Fn(usize) -> Shift,
+        device: &Device,
+    ) -> Result<Self> {
         let length = episodes.iter().map(|episode| episode.len()).max().unwrap_or(0);
         let (mut embeds, mut actions, mut first) = (Vec::new(), Vec::new(), Vec::new());
         let (mut chosen, mut taken) = (Vec::new(), Vec::new());
         for (row, episode) in episodes.iter().enumerate() {
             let missing = length - episode.len();
-            let images: Vec<u8> = episode.image.iter().copied().collect();
+            let mut images: Vec<u8> = episode.image.iter().copied().collect();
+            shift(row).apply(&mut images, IMAGE_CHANNELS);
             let shape = (1, episode.len(), IMAGE_SIDE, IMAGE_SIDE, IMAGE_CHANNELS);
             let own = agent.world.encode(&Tensor::from_vec(images, shape, device)?)?;
             embeds.push(own.iter().map(|x| x.pad_with_zeros(1, 0, missing)).collect::<Result<Vec<_>>>()?);
@@ -144,10 +168,12 @@ impl Padded {
     }
 }
 
-/// The steps of an episode in which an action was taken, with the action, each in [-1, 1].
+/// The steps of an episode in which an action was taken that is an example, with the action, each in [-1, 1].
 pub fn actions_taken(episode: &Episode) -> impl Iterator<Item = (usize, [f32; ACTION_LEN])> {
     let taken = move |t: usize| std::array::from_fn(|i| episode.action[[t + 1, i]].clamp(-1.0, 1.0));
-    (0..episode.len().saturating_sub(1)).filter(|t| !episode.is_first[t + 1]).map(move |t| (t, taken(t)))
+    (0..episode.len().saturating_sub(1))
+        .filter(|t| !episode.is_first[t + 1] && !episode.pushed[t + 1])
+        .map(move |t| (t, taken(t)))
 }
 
 /// The state that `features` [N, state width] were made of. What is known of its logits is where z has its classes: imagination never

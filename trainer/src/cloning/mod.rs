@@ -15,7 +15,7 @@ mod learner;
 mod loss;
 mod settings;
 
-pub use examples::{Examples, actions_taken, state_of_features};
+pub use examples::{Examples, Views, actions_taken, state_of_features};
 pub use learner::{CloningLearner, CloningUpdate};
 pub use loss::{CloningLoss, cloning_loss};
 pub use settings::{CloningSettings, Ramp};

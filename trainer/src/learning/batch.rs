@@ -20,6 +20,10 @@ pub struct Batch {
     pub first: FirstSteps,
     /// 1 where the robot is, else 0: u8 or f32 [B, T, 64, 64, 1]; none when masks are not used.
     pub robot_mask: Option<Tensor>,
+    /// By row, then step: true where the action was a push off course and is no example.
+    pub pushed: Vec<bool>,
+    /// Which batch of a run it is: where only some steps are painted, these take turns by it.
+    pub number: u64,
 }
 
 impl Batch {
@@ -36,6 +40,8 @@ impl Batch {
             terminal: part(&self.terminal)?,
             first: self.first.rows(rows),
             robot_mask: self.robot_mask.as_ref().map(part).transpose()?,
+            pushed: self.pushed[rows.start * self.first.length()..rows.end * self.first.length()].to_vec(),
+            number: self.number,
         })
     }
 }
@@ -59,6 +65,10 @@ pub struct HostBatch {
     pub first: Vec<bool>,
     /// B * T masks, 1 where the robot is; empty when masks are not used.
     pub robot_mask: Vec<u8>,
+    /// B * T flags.
+    pub pushed: Vec<bool>,
+    /// See [`Batch`].
+    pub number: u64,
 }
 
 impl HostBatch {
@@ -76,7 +86,9 @@ impl HostBatch {
             reward: Tensor::from_vec(self.reward, (b, t), device)?,
             terminal: Tensor::from_vec(terminal, (b, t), device)?,
             first: FirstSteps::new(self.first, t),
+            pushed: self.pushed,
             robot_mask: if self.robot_mask.is_empty() { None } else { Some(mask(self.robot_mask)?) },
+            number: self.number,
         })
     }
 }

@@ -4,7 +4,7 @@ use serde::Serialize;
 use super::parts::part;
 use super::{Batch, BranchKl, WorldSettings, balanced_kl};
 use crate::model::agent::Agent;
-use crate::model::latent::Sampler;
+use crate::model::latent::{Sampler, State};
 use crate::model::world::Observed;
 use crate::ops;
 
@@ -21,6 +21,8 @@ pub struct WorldLosses {
     pub continues: Tensor,
     /// Each branch's KL, the robot's first.
     pub branches: Vec<BranchKl>,
+    /// Distance of the actor from demonstrated actions, where it has a part in the loss.
+    pub cloning: Option<Tensor>,
     /// The sum with factors, which is differentiated.
     pub total: Tensor,
     /// The filtered batch.
@@ -42,6 +44,9 @@ pub struct LossValues {
     /// See [`WorldLosses`].
     #[serde(rename = "continue")]
     pub continues: f64,
+    /// See [`WorldLosses`].
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub cloning: Option<f64>,
     /// KL of the robot's branch (vanilla: of the only one), before it is clipped.
     pub robot_kl: f64,
     /// KL of the environment's branch.
@@ -61,10 +66,27 @@ pub fn world_losses(
 ) -> Result<WorldLosses> {
     let embeds = part("encode", || agent.world.encode(&batch.image))?;
     let observed = part("observe", || agent.world.observe(&embeds, &batch.action, &batch.first, sampler))?;
-    let painted = part("decode", || {
-        agent.world.picture_loss(&observed.posteriors, &batch.image, batch.robot_mask.as_ref())
-    })?;
+    let painted = part("decode", || painted(agent, batch, settings.paint_every, &observed.posteriors))?;
     part("other losses", || other_losses(agent, batch, settings, observed, painted))
+}
+
+/// Squared errors of the pictures and the robot's masks at every `every`-th step, which one first depends on the batch's number.
+fn painted(
+    agent: &Agent,
+    batch: &Batch,
+    every: usize,
+    posteriors: &State,
+) -> Result<(Tensor, Option<Tensor>)> {
+    let (every, length) = (every as u64, batch.first.length() as u64);
+    if every == 1 {
+        return agent.world.picture_loss(posteriors, &batch.image, batch.robot_mask.as_ref());
+    }
+    let steps: Vec<u32> = (0..length).filter(|t| (t + batch.number) % every == 0).map(|t| t as u32).collect();
+    let count = steps.len();
+    let steps = Tensor::from_vec(steps, count, batch.image.device())?;
+    let chosen = |x: &Tensor| x.contiguous()?.index_select(&steps, 1);
+    let masks = batch.robot_mask.as_ref().map(chosen).transpose()?;
+    agent.world.picture_loss(&posteriors.map(chosen)?, &chosen(&batch.image)?, masks.as_ref())
 }
 
 /// Heads, divergences and the sum, from the squared errors of the pictures and the robot's masks, [B*T] each.
@@ -96,7 +118,7 @@ fn other_losses(
     for branch in &branches {
         total = (total + branch.loss.mean_all()?)?;
     }
-    Ok(WorldLosses { image, robot_mask, reward, continues, branches, total, observed })
+    Ok(WorldLosses { image, robot_mask, reward, continues, branches, cloning: None, total, observed })
 }
 
 /// Binary cross-entropy of the logits [B, T, 1] against going on, where not `terminal` [B, T]: a scalar. As a softmax over the
@@ -117,6 +139,7 @@ impl WorldLosses {
             reward: self.reward.detach(),
             continues: self.continues.detach(),
             branches: self.branches.iter().map(BranchKl::detached).collect(),
+            cloning: self.cloning.as_ref().map(Tensor::detach),
             total: self.total.detach(),
             observed: self.observed.detached(),
         }
@@ -146,6 +169,7 @@ impl WorldLosses {
             branches: (0..shares.first().map_or(0, |(_, losses)| losses.branches.len()))
                 .map(branch)
                 .collect::<Result<_>>()?,
+            cloning: sum(|losses| losses.cloning.as_ref())?,
             total: all(|losses| Some(&losses.total))?,
             observed: Observed::cat(&observed)?,
         })
@@ -165,6 +189,7 @@ impl WorldLosses {
             robot_mask: self.robot_mask.as_ref().map(scalar).transpose()?,
             reward: scalar(&self.reward)?,
             continues: scalar(&self.continues)?,
+            cloning: self.cloning.as_ref().map(scalar).transpose()?,
             robot_kl: kl(0)?.unwrap_or_default(),
             environment_kl: kl(1)?,
         })

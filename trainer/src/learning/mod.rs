@@ -8,6 +8,7 @@
 //! | `kl` | balanced KL with free bits, per branch |
 //! | `gradients`, `adam` | gradients by name, clipping, the optimiser |
 //! | `parts` | where the time of an update goes |
+//! | `shift` | pictures that are moved by some pixels |
 //! | `sides` | which parameters belong to the robot's side, the environment's, the behaviour |
 //! | `world` | one update of the world model |
 
@@ -18,6 +19,7 @@ mod kl;
 mod losses;
 pub mod parts;
 mod settings;
+mod shift;
 mod sides;
 mod world;
 
@@ -27,8 +29,9 @@ pub use gradients::Gradients;
 pub use kl::{BranchKl, balanced_kl};
 pub use losses::{LossValues, WorldLosses, world_losses};
 pub use settings::WorldSettings;
+pub use shift::Shift;
 pub use sides::{Side, Trained, side_of};
-pub use world::{WorldLearner, WorldUpdate};
+pub use world::{Imitation, WorldLearner, WorldUpdate};
 
 use crate::model::parameters::ParameterError;
 

@@ -36,6 +36,10 @@ pub enum Trained {
     World,
     /// The environment's side alone (first stage of few-shot adaptation).
     Environment,
+    /// The whole world model and the actor, by one loss.
+    WorldAndActor,
+    /// The environment's side and the actor, by one loss.
+    EnvironmentAndActor,
     /// The actor.
     Actor,
     /// The critic.
@@ -53,6 +57,10 @@ impl Trained {
         match self {
             Self::World => |name| matches!(side_of(name), Side::Robot | Side::Environment),
             Self::Environment => |name| side_of(name) == Side::Environment,
+            Self::WorldAndActor => {
+                |name| matches!(side_of(name), Side::Robot | Side::Environment | Side::Actor)
+            }
+            Self::EnvironmentAndActor => |name| matches!(side_of(name), Side::Environment | Side::Actor),
             Self::Actor => |name| side_of(name) == Side::Actor,
             Self::Critic => |name| side_of(name) == Side::Critic,
             Self::Behaviour => |name| matches!(side_of(name), Side::Actor | Side::Critic),

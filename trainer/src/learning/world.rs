@@ -7,6 +7,7 @@ use super::{
     Adam, Batch, Gradients, LearningError, LossValues, Side, Trained, WorldLosses, WorldSettings, side_of,
     world_losses,
 };
+use crate::cloning::{CloningLoss, Examples, cloning_loss};
 use crate::model::agent::Agent;
 use crate::model::latent::{Sampler, State};
 use crate::model::parameters::Parameters;
@@ -19,7 +20,19 @@ pub struct WorldLearner {
     parameters: Parameters,
     trained: Trained,
     settings: WorldSettings,
+    imitation: Option<Imitation>,
     adam: Adam,
+}
+
+/// The actor's part in the world model's loss: what a demonstrated action depends on is worth representing, however few its pixels.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct Imitation {
+    /// Factor of the distance from the demonstrated actions.
+    pub scale: f64,
+    /// What the distance is.
+    pub loss: CloningLoss,
+    /// Learning rate of the actor.
+    pub learning_rate: f64,
 }
 
 /// What one update of the world model was.
@@ -46,14 +59,22 @@ impl WorldLearner {
     ) -> Result<Self, LearningError> {
         let adam = Adam::new(settings.adam.clone());
         let agent = Agent::new(&parameters.trainable_where(trained.filter()), model)?;
-        Ok(Self { agent, parameters: parameters.clone(), trained, settings: settings.clone(), adam })
+        Ok(Self {
+            agent,
+            parameters: parameters.clone(),
+            trained,
+            settings: settings.clone(),
+            imitation: None,
+            adam,
+        })
     }
 
-    /// Trains another part from now on; the optimiser goes on.
+    /// Trains another part from now on; the optimiser goes on. The actor is only among what is trained together with an `imitation`.
     ///
     /// # Errors
     /// If the parameters do not fit the model.
-    pub fn train(&mut self, trained: Trained) -> Result<(), LearningError> {
+    pub fn train(&mut self, trained: Trained, imitation: Option<Imitation>) -> Result<(), LearningError> {
+        self.imitation = imitation;
         self.agent = Agent::new(&self.parameters.trainable_where(trained.filter()), &self.agent.settings)?;
         self.trained = trained;
         Ok(())
@@ -75,7 +96,15 @@ impl WorldLearner {
     /// # Errors
     /// Those of candle.
     pub fn losses(&self, batch: &Batch, sampler: &mut Sampler) -> candle_core::Result<WorldLosses> {
-        world_losses(&self.agent, batch, &self.settings, sampler)
+        let mut losses = world_losses(&self.agent, batch, &self.settings, sampler)?;
+        if let Some(imitation) = &self.imitation {
+            let features = losses.observed.posteriors.features()?; // [B, T, state width]
+            let (features, actions) = Examples::of_batch(&features, batch)?;
+            let loss = cloning_loss(&self.agent.actor, &features, &actions, imitation.loss)?;
+            losses.total = (&losses.total + (&loss * imitation.scale)?)?;
+            losses.cloning = Some(loss);
+        }
+        Ok(losses)
     }
 
     /// The losses of a batch, without their graph, and the gradients of the total in what is trained.
@@ -122,6 +151,7 @@ impl WorldLearner {
         let environment = self.settings.environment_learning_rate;
         self.adam.step_at(&self.parameters, gradients, |name| match side_of(name) {
             Side::Environment if environment > 0.0 => environment,
+            Side::Actor => self.imitation.map_or(rate, |imitation| imitation.learning_rate),
             _ => rate,
         })
     }

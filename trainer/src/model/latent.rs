@@ -163,6 +163,12 @@ impl FirstSteps {
         Self { flags, length: self.length }
     }
 
+    /// By row, then step: [B, T].
+    #[must_use]
+    pub fn flags(&self) -> &[bool] {
+        &self.flags
+    }
+
     /// B.
     #[must_use]
     pub fn batch(&self) -> usize {

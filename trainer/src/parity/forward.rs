@@ -144,6 +144,8 @@ pub(super) fn batch(reference: &Reference, device: &Device) -> Result<Batch, Par
         terminal: input("is_terminal")?,
         first: FirstSteps::new(first.into_iter().map(|flag| flag != 0.0).collect(), reference.length),
         robot_mask: Some(input("robot_mask")?),
+        pushed: vec![false; reference.batch * reference.length],
+        number: 0,
     })
 }
 

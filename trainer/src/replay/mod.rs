@@ -20,4 +20,4 @@ mod store;
 pub use load::{Folder, LoadError};
 pub use prefetch::{Prefetch, PrefetchError};
 pub use shared::SharedReplay;
-pub use store::{Replay, ReplayError, append_steps};
+pub use store::{Replay, ReplayError, Starts, append_steps};

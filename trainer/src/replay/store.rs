@@ -5,6 +5,7 @@ use ndarray::Axis;
 use rand::{Rng, SeedableRng};
 use rand_chacha::ChaCha8Rng;
 use rcwm_models::episode::Episode;
+use serde::{Deserialize, Serialize};
 
 use crate::learning::HostBatch;
 
@@ -51,6 +52,17 @@ pub enum ReplayError {
         /// The task.
         task: String,
     },
+}
+
+/// Where sequences begin.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Default, Serialize, Deserialize)]
+#[serde(rename_all = "kebab-case")]
+pub enum Starts {
+    /// At any step, each equally likely.
+    #[default]
+    Anywhere,
+    /// Every other one at the first step of an episode, each episode equally likely: what is seen only there must be remembered.
+    Episodes,
 }
 
 /// An episode and when it came.
@@ -167,24 +179,51 @@ impl Replay {
         seed: u64,
         number: u64,
     ) -> Result<HostBatch, ReplayError> {
+        self.draw_from(Starts::Anywhere, rows, length, masks, seed, number)
+    }
+
+    /// [`Replay::draw`] of sequences that begin where `starts` says.
+    ///
+    /// # Errors
+    /// [`ReplayError::NothingToDraw`] or [`ReplayError::NoMasks`].
+    pub fn draw_from(
+        &self,
+        starts: Starts,
+        rows: usize,
+        length: usize,
+        masks: bool,
+        seed: u64,
+        number: u64,
+    ) -> Result<HostBatch, ReplayError> {
         if self.tasks.is_empty() {
             return Err(ReplayError::NothingToDraw { masks });
         }
         let mut generator = ChaCha8Rng::seed_from_u64(seed);
         generator.set_stream(number);
-        let mut batch = HostBatch { rows, length, ..HostBatch::default() };
+        let mut batch = HostBatch { rows, length, number, ..HostBatch::default() };
         let tasks: Vec<_> = self.tasks.iter().collect();
         // The turn goes on from batch to batch, so that shares are equal also where they do not divide a batch.
         let turn = (number % tasks.len() as u64) as usize * (rows % tasks.len());
         for row in 0..rows {
             let (name, task) = tasks[(turn + row) % tasks.len()];
-            task.append(name, generator.random_range(0..task.steps), length, masks, &mut batch)?;
+            let start = match starts {
+                Starts::Episodes if row.is_multiple_of(2) => {
+                    task.first_step_of(generator.random_range(0..task.episodes.len()))
+                }
+                _ => generator.random_range(0..task.steps),
+            };
+            task.append(name, start, length, masks, &mut batch)?;
         }
         Ok(batch)
     }
 }
 
 impl Task {
+    /// Where an episode begins among all steps of this task.
+    fn first_step_of(&self, episode: usize) -> usize {
+        self.episodes.iter().take(episode).map(|stored| stored.episode.len()).sum()
+    }
+
     /// Appends `length` steps that begin at step `start` of all this task's steps.
     fn append(
         &self,
@@ -231,6 +270,7 @@ pub fn append_steps(
     batch.terminal.extend(episode.is_terminal.slice_axis(Axis(0), range));
     // What a file does not say of its first step is true all the same: nothing came before it.
     batch.first.extend((from..from + count).map(|step| step == 0 || episode.is_first[step]));
+    batch.pushed.extend(episode.pushed.slice_axis(Axis(0), range));
     if masks {
         let mask = episode.robot_mask.as_ref();
         let mask = mask.ok_or_else(|| ReplayError::NoMasks { task: name.to_owned() })?;
@@ -290,6 +330,28 @@ mod tests {
             }
         }
         assert!(starts.iter().all(|count| (60..140).contains(count)), "not uniform: {starts:?}");
+    }
+
+    #[test]
+    fn every_other_sequence_begins_with_an_episode_where_that_is_asked_for() {
+        let mut replay = Replay::new(100);
+        for (from, steps) in [(0, 5), (5, 3), (8, 20)] {
+            replay.add("reach", episode(from, steps, false)).unwrap();
+        }
+        let mut seen = [0; 28];
+        for number in 0..300 {
+            let batch = replay.draw_from(Starts::Episodes, 4, 3, false, 7, number).unwrap();
+            for row in 0..4 {
+                let start = batch.reward[row * 3] as usize;
+                if row % 2 == 0 {
+                    assert!(batch.first[row * 3], "row {row} begins at {start}");
+                    seen[start] += 1;
+                }
+            }
+            let anywhere = replay.draw(4, 3, false, 7, number).unwrap();
+            assert_eq!((anywhere.number, batch.number), (number, number));
+        }
+        assert!([0, 5, 8].iter().all(|start| (160..240).contains(&seen[*start])), "{seen:?}");
     }
 
     #[test]

@@ -7,13 +7,15 @@ pub enum Script {
     Expert,
     /// The expert with noise and bursts of random actions.
     Mixed,
+    /// The expert, pushed off course now and then.
+    Pushed,
     /// Uniform in [-1, 1].
     Random,
 }
 
 impl Script {
     /// All of them.
-    pub const ALL: [Self; 3] = [Self::Expert, Self::Mixed, Self::Random];
+    pub const ALL: [Self; 4] = [Self::Expert, Self::Mixed, Self::Random, Self::Pushed];
 
     /// The simulator's name of it, and the beginning of its episodes' file names.
     #[must_use]
@@ -22,6 +24,7 @@ impl Script {
             Self::Expert => "expert",
             Self::Mixed => "mixed",
             Self::Random => "random",
+            Self::Pushed => "pushed",
         }
     }
 
@@ -31,6 +34,7 @@ impl Script {
             Self::Expert => 0,
             Self::Mixed => 1_000_000,
             Self::Random => 2_000_000,
+            Self::Pushed => 3_000_000,
         }
     }
 }
@@ -44,6 +48,8 @@ pub struct Amounts {
     pub mixed: u64,
     /// By chance.
     pub random: u64,
+    /// By the expert, pushed off course now and then.
+    pub pushed: u64,
     /// How many of all these have robot masks.
     pub masked: u64,
 }
@@ -56,20 +62,21 @@ impl Amounts {
             Script::Expert => self.expert,
             Script::Mixed => self.mixed,
             Script::Random => self.random,
+            Script::Pushed => self.pushed,
         }
     }
 
     /// All episodes of a task.
     #[must_use]
     pub const fn total(&self) -> u64 {
-        self.expert + self.mixed + self.random
+        self.expert + self.mixed + self.random + self.pushed
     }
 
     /// How many of a script's episodes have masks, its first ones: equal shares as far as they go, the most varied first.
     fn masked_of(&self, script: Script) -> u64 {
         let mut left = self.masked.min(self.total());
-        let mut given = [0_u64; 3];
-        let order = [Script::Mixed, Script::Random, Script::Expert];
+        let mut given = [0_u64; 4];
+        let order = [Script::Mixed, Script::Random, Script::Expert, Script::Pushed];
         while left > 0 {
             for (share, script) in given.iter_mut().zip(order) {
                 if left > 0 && *share < self.of(script) {

@@ -1,17 +1,19 @@
 use std::path::Path;
 
-use super::TrainingError;
+use rcwm_models::episode::Episode;
+
+use super::{FewshotSettings, TrainingError};
 use crate::replay::{Folder, LoadError, Replay};
 
-/// The first `count` successful episodes in the folder of a task's episodes, in the order of their names: `collect` names those of the
-/// scripted expert so that they come first.
+/// The first demonstrations in the folder of a task's episodes that the settings ask for, in the order of their names: `collect` names
+/// those of the scripted expert so that they come first.
 ///
 /// # Errors
 /// [`TrainingError::NoDemonstrations`] if there is none, or those of reading.
 pub fn demonstrations(
     data: &Path,
     task: &str,
-    count: usize,
+    settings: &FewshotSettings,
     capacity_steps: usize,
     mut seen: impl FnMut(),
 ) -> Result<Replay, TrainingError> {
@@ -22,10 +24,10 @@ pub fn demonstrations(
         episodes += 1;
         if episode.succeeded() {
             let refused = |source| LoadError::Refused { path: path.to_path_buf(), source };
-            replay.add(name, episode).map_err(refused)?;
+            replay.add(name, cut(episode, settings.steps_after_success)).map_err(refused)?;
             seen();
         }
-        if replay.episodes() == count {
+        if replay.episodes() == settings.demonstrations {
             break;
         }
     }
@@ -38,4 +40,12 @@ pub fn demonstrations(
         });
     }
     Ok(replay)
+}
+
+/// The episode up to so many steps after its first success.
+fn cut(episode: Episode, steps_after_success: usize) -> Episode {
+    match episode.success.iter().position(|success| *success) {
+        Some(first) => episode.shortened(first.saturating_add(steps_after_success).saturating_add(1)),
+        None => episode,
+    }
 }

@@ -14,8 +14,8 @@ use super::{
     TrainingState, start_from,
 };
 use crate::checkpoint::Checkpoint;
-use crate::cloning::{CloningLearner, Examples, state_of_features};
-use crate::learning::{Trained, WorldLearner};
+use crate::cloning::{CloningLearner, Examples, Views, cloning_loss, state_of_features};
+use crate::learning::{Imitation, Trained, WorldLearner};
 use crate::model::agent::Agent;
 use crate::model::latent::Sampler;
 use crate::model::parameters::Parameters;
@@ -64,10 +64,12 @@ impl Stage {
     }
 
     /// What of the world model it trains.
-    fn trained(self, kind: ModelKind) -> Trained {
-        match (self, kind) {
-            (Self::Environment, ModelKind::Rcwm) => Trained::Environment,
-            _ => Trained::World,
+    fn trained(self, kind: ModelKind, imitates: bool) -> Trained {
+        match (self, kind, imitates) {
+            (Self::Environment, ModelKind::Rcwm, false) => Trained::Environment,
+            (Self::Environment, ModelKind::Rcwm, true) => Trained::EnvironmentAndActor,
+            (_, _, true) => Trained::WorldAndActor,
+            (_, _, false) => Trained::World,
         }
     }
 }
@@ -83,6 +85,7 @@ pub struct Fewshot {
     cloning: CloningLearner,
     state: TrainingState,
     scenes: Vec<Scene>,
+    held_out: Vec<Arc<Episode>>,
 }
 
 impl Fewshot {
@@ -134,6 +137,7 @@ impl Fewshot {
             cloning,
             state,
             scenes: Vec::new(),
+            held_out: Vec::new(),
         })
     }
 
@@ -183,8 +187,11 @@ impl Fewshot {
         mut show: impl FnMut(u64, Option<&Line>),
     ) -> Result<Outcome, TrainingError> {
         let total = self.settings.fewshot.updates();
-        self.scenes = self.settings.film.scenes(&replay);
-        let episodes: Vec<_> = replay.tasks().flat_map(|(_, episodes)| episodes).cloned().collect();
+        let (replay, held_out) = replay.hold_out(self.settings.fewshot.held_out);
+        self.scenes = self.settings.film.scenes(if held_out.episodes() > 0 { &held_out } else { &replay });
+        let of = |replay: &Replay| replay.tasks().flat_map(|(_, episodes)| episodes).cloned().collect();
+        let episodes: Vec<_> = of(&replay);
+        self.held_out = of(&held_out);
         let mut work = Work { batches: None, replay, examples: None, stage: None };
         let mut interval = Interval::begin();
         let mut saved_at = None;
@@ -222,23 +229,33 @@ impl Fewshot {
         episodes: &[Arc<Episode>],
     ) -> Result<(), TrainingError> {
         work.stage = Some(stage);
-        self.world.train(stage.trained(self.settings.model.kind))?;
         let fewshot = &self.settings.fewshot;
+        let imitation = (stage != Stage::Actor && fewshot.imitation_scale > 0.0).then(|| Imitation {
+            scale: fewshot.imitation_scale,
+            loss: fewshot.cloning.loss,
+            learning_rate: self.settings.world.adam.learning_rate,
+        });
+        self.world.train(stage.trained(self.settings.model.kind, imitation.is_some()), imitation)?;
         let seed = self.settings.seed;
         if stage != Stage::Actor || fewshot.world_goes_on {
             if work.batches.is_none() {
                 let (sizes, replay) = (self.settings.replay.clone(), work.replay.clone());
+                let (shift, starts) = (fewshot.shift, fewshot.starts);
                 work.batches = Some(Prefetch::start(self.state.updates, sizes.prefetch, move |number| {
-                    replay.draw(sizes.batch, sizes.length, false, seed ^ REPLAY_STREAM, number)
+                    let seed = seed ^ REPLAY_STREAM;
+                    let mut batch =
+                        replay.draw_from(starts, sizes.batch, sizes.length, false, seed, number)?;
+                    batch.shift(shift, seed, number);
+                    Ok(batch)
                 })?);
             }
             return Ok(());
         }
         work.batches = None;
         let agent = Agent::new(&self.parameters.frozen(), &self.settings.model)?;
-        let draws = fewshot.cloning.draws;
-        work.examples =
-            Some(Examples::filter(&agent, episodes, draws, seed ^ EXAMPLES_STREAM, &self.device)?);
+        let views =
+            Views { draws: fewshot.cloning.draws, shift: fewshot.shift, seed: seed ^ EXAMPLES_STREAM };
+        work.examples = Some(Examples::filter(&agent, episodes, &views, &self.device)?);
         Ok(())
     }
 
@@ -255,12 +272,11 @@ impl Fewshot {
         }
         let batches = work.batches.as_mut().expect("entering a stage that draws batches starts them");
         let batch = interval.time(Spent::WaitingForBatches, || batches.next_batch())?;
-        let first = batch.first.clone();
         let batch = batch.into_tensors(&self.device)?;
         let update = interval.time(Spent::Learning, || self.world.update(&batch, &mut sampler))?;
         let losses = json!({"losses": update.losses, "gradient_norm": update.gradient_norm});
         if stage == Stage::Actor {
-            let examples = Examples::of_batch(&update.posteriors.features()?, &batch.action, &first)?;
+            let examples = Examples::of_batch(&update.posteriors.features()?, &batch)?;
             return self.clone_from_batch(number, examples, losses, &mut sampler, interval);
         }
         interval.update(&losses);
@@ -306,14 +322,27 @@ impl Fewshot {
         Ok(())
     }
 
+    /// How far the actor is from what was done in demonstrations that it does not learn from.
+    fn held_out_cloning(&self, agent: &Agent) -> Result<f32, TrainingError> {
+        let views = Views { draws: 1, shift: 0, seed: 0 };
+        let examples = Examples::filter(agent, &self.held_out, &views, &self.device)?;
+        let (features, actions) = examples.all();
+        let loss = cloning_loss(&agent.actor, features, actions, self.settings.fewshot.cloning.loss)?;
+        Ok(loss.to_scalar::<f32>()?)
+    }
+
     fn save(&mut self) -> Result<(), TrainingError> {
         self.state.return_range = self.cloning.return_range();
         let [actor, critic] = self.cloning.adams();
         let [world_name, actor_name, critic_name] = OPTIMISERS;
         let optimisers = [(world_name, self.world.adam()), (actor_name, actor), (critic_name, critic)];
         self.run.save(&self.parameters, &self.settings, &self.state, &optimisers, Best::No)?;
-        self.run.draw_curves(0)?;
         let agent = Agent::new(&self.parameters.frozen(), &self.settings.model)?;
+        if !self.held_out.is_empty() {
+            let cloning = self.held_out_cloning(&agent)?;
+            self.run.log(&json!({"update": self.state.updates, "held_out": {"cloning": cloning}}))?;
+        }
+        self.run.draw_curves(0)?;
         let (film, update) = (&self.settings.film, self.state.updates);
         write_films(&self.run, &agent, &self.scenes, film, update, &self.device)
     }

@@ -1,7 +1,10 @@
+use rcwm_models::IMAGE_SIDE;
+use rcwm_models::episode::STEPS_MAX;
 use rcwm_models::settings::{Preset, SettingsError};
 use serde::{Deserialize, Serialize};
 
 use crate::cloning::{CloningSettings, Ramp};
+use crate::replay::Starts;
 
 /// What a run is.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default, Serialize, Deserialize)]
@@ -38,12 +41,24 @@ impl Phase {
 pub struct FewshotSettings {
     /// Successful episodes that are used, in the order of their names.
     pub demonstrations: usize,
+    /// Steps of a demonstration that are used after its first success: what comes long after it is holding still, which teaches nothing
+    /// and would be most of what is learned from.
+    pub steps_after_success: usize,
+    /// Demonstrations of these that are not learned from: the cloning loss on them is told with every checkpoint.
+    pub held_out: usize,
     /// Updates of the environment's side alone.
     pub environment_updates: u64,
     /// Updates of the whole world model.
     pub world_updates: u64,
     /// Updates of the actor.
     pub actor_updates: u64,
+    /// Factor of the cloning loss while the world model learns: above 0 the actor learns from the first update on, and its gradient goes
+    /// on into posteriors and encoders. 0 is what the authors do.
+    pub imitation_scale: f64,
+    /// Where the sequences begin that the world model learns from.
+    pub starts: Starts,
+    /// Pixels by which pictures are shifted at most, a whole sequence alike: what is learned should not depend on where the camera hangs.
+    pub shift: usize,
     /// Whether the world model goes on learning while the actor does; frozen, its states are computed once.
     pub world_goes_on: bool,
     /// The actor's stage.
@@ -54,9 +69,14 @@ impl Default for FewshotSettings {
     fn default() -> Self {
         Self {
             demonstrations: 50,
+            steps_after_success: STEPS_MAX,
+            held_out: 0,
             environment_updates: 2000,
             world_updates: 2000,
             actor_updates: 20_000,
+            imitation_scale: 0.0,
+            starts: Starts::Anywhere,
+            shift: 0,
             world_goes_on: false,
             cloning: CloningSettings::default(),
         }
@@ -108,6 +128,18 @@ impl FewshotSettings {
     pub(super) fn validate(&self) -> Result<(), SettingsError> {
         if self.demonstrations == 0 {
             return Err(SettingsError::Invalid("fewshot.demonstrations = 0, expected at least 1".into()));
+        }
+        if !(self.imitation_scale.is_finite() && self.imitation_scale >= 0.0) {
+            return Err(SettingsError::Invalid(format!(
+                "fewshot.imitation_scale = {}, expected a factor of at least 0",
+                self.imitation_scale
+            )));
+        }
+        if self.shift >= IMAGE_SIDE {
+            return Err(SettingsError::Invalid(format!(
+                "fewshot.shift = {}, expected fewer pixels than a picture has: {IMAGE_SIDE}",
+                self.shift
+            )));
         }
         self.cloning.validate()
     }

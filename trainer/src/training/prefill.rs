@@ -150,7 +150,7 @@ fn record(
     let random = finetune.random_steps.div_ceil(u64::from(finetune.episode_steps));
     let mut expert = finetune.expert_episodes;
     for round in 0..EXPERT_ROUNDS {
-        let amounts = Amounts { expert, random, masked: 0, mixed: 0 };
+        let amounts = Amounts { expert, random, ..Amounts::default() };
         let amounts = Amounts { masked: if finetune.masks { amounts.total() } else { 0 }, ..amounts };
         let tasks = [settings.task.clone()];
         let plan = Plan::new(&collecting.out, &tasks, &amounts, settings.seed, EPISODES_A_RUN);

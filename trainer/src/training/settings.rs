@@ -191,6 +191,12 @@ impl TrainingSettings {
                 return Err(SettingsError::Invalid(format!("{name} = {value}, expected at least {least}")));
             }
         }
+        if !(1..=replay.length).contains(&self.world.paint_every) {
+            return Err(SettingsError::Invalid(format!(
+                "world.paint_every = {}, expected 1 to replay.length = {}",
+                self.world.paint_every, replay.length
+            )));
+        }
         for (name, every) in
             [("metrics_every", self.metrics_every), ("checkpoint_every", self.checkpoint_every)]
         {
