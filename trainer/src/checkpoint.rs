@@ -2,7 +2,8 @@
 //!
 //! ```text
 //! checkpoint.toml               format, sizes, preset, seed, updates, sha256 of the weights
-//! weights-<sha256>.safetensors  every parameter by name, f32; the name holds the checksum's first 16 digits
+//! weights-<sha256>.safetensors  every parameter by name, f32, or f16 where that loses nothing ([`Checkpoint::rounded`]); the name
+//!                               holds the checksum's first 16 digits
 //! ```
 //!
 //! Both files are written whole or not at all, the settings last, and only then are older weights removed: whenever the writer
@@ -12,7 +13,7 @@ use std::collections::BTreeMap;
 use std::fs;
 use std::path::{Path, PathBuf};
 
-use candle_core::{Device, Tensor};
+use candle_core::{DType, Device, Tensor};
 use rcwm_models::files::{FileError, read_capped, sha256_hex, write_atomic};
 use rcwm_models::settings::{ModelSettings, SettingsError};
 use safetensors::{Dtype, SafeTensors, tensor::TensorView};
@@ -80,7 +81,7 @@ pub enum CheckpointError {
     #[error("checkpoint: the weights are not a readable safetensors file: {0}")]
     Weights(#[from] safetensors::SafeTensorError),
     /// A parameter is not f32.
-    #[error("checkpoint: parameter {name} has type {found}, expected F32")]
+    #[error("checkpoint: parameter {name} has type {found}, expected F32 or F16")]
     DType {
         /// The parameter.
         name: String,
@@ -131,6 +132,21 @@ impl Checkpoint {
     /// Those of reading the parameters.
     pub fn weights_sha256(&self) -> Result<String, CheckpointError> {
         Ok(sha256_hex(&weights_to_bytes(&self.parameters)?))
+    }
+
+    /// The same with every weight rounded to the nearest that 16 bits hold: half the size for who ships it, and what is exported of it
+    /// compresses to half.
+    ///
+    /// # Errors
+    /// Those of candle.
+    pub fn rounded(&self) -> Result<Self, CheckpointError> {
+        let round = |(name, var): (&str, &candle_core::Var)| {
+            Ok((name.to_owned(), var.to_dtype(DType::F16)?.to_dtype(DType::F32)?))
+        };
+        let tensors = self.parameters.iter().map(round).collect::<Result<_, CheckpointError>>()?;
+        let specs = agent::specs(&self.settings.model)?;
+        let parameters = Parameters::from_tensors(&specs, tensors, &Device::Cpu)?;
+        Ok(Self { settings: self.settings.clone(), parameters })
     }
 
     /// Writes the checkpoint into `folder`, which is made if it is not there.
@@ -196,14 +212,27 @@ fn remove_other_weights(folder: &Path, keep: &str) -> std::io::Result<()> {
 
 fn weights_to_bytes(parameters: &Parameters) -> Result<Vec<u8>, CheckpointError> {
     let host = |(name, var): (&str, &candle_core::Var)| {
-        let values = var.flatten_all()?.to_vec1::<f32>()?;
-        let bytes: Vec<u8> = values.iter().flat_map(|value| value.to_le_bytes()).collect();
-        Ok((name.to_owned(), var.dims().to_vec(), bytes))
+        let whole = var.flatten_all()?.to_device(&Device::Cpu)?;
+        let half = whole.to_dtype(DType::F16)?;
+        let values = whole.to_vec1::<f32>()?;
+        let fits = half.to_dtype(DType::F32)?.to_vec1::<f32>()? == values;
+        let halves = half.to_vec1::<half::f16>()?;
+        Ok((name.to_owned(), var.dims().to_vec(), fits, values, halves))
     };
     let arrays = parameters.iter().map(host).collect::<Result<Vec<_>, CheckpointError>>()?;
+    let all_fit = arrays.iter().all(|(_, _, fits, ..)| *fits);
+    let dtype = if all_fit { Dtype::F16 } else { Dtype::F32 };
+    let bytes: Vec<Vec<u8>> = arrays
+        .iter()
+        .map(|(.., values, halves)| match dtype {
+            Dtype::F16 => halves.iter().flat_map(|value| value.to_le_bytes()).collect(),
+            _ => values.iter().flat_map(|value| value.to_le_bytes()).collect(),
+        })
+        .collect();
     let views = arrays
         .iter()
-        .map(|(name, shape, bytes)| Ok((name, TensorView::new(Dtype::F32, shape.clone(), bytes)?)))
+        .zip(&bytes)
+        .map(|((name, shape, ..), bytes)| Ok((name, TensorView::new(dtype, shape.clone(), bytes)?)))
         .collect::<Result<Vec<_>, CheckpointError>>()?;
     Ok(safetensors::serialize(views, None)?)
 }
@@ -211,11 +240,14 @@ fn weights_to_bytes(parameters: &Parameters) -> Result<Vec<u8>, CheckpointError>
 fn weights_from_bytes(bytes: &[u8]) -> Result<BTreeMap<String, Tensor>, CheckpointError> {
     let mut tensors = BTreeMap::new();
     for (name, view) in SafeTensors::deserialize(bytes)?.tensors() {
-        if view.dtype() != Dtype::F32 {
-            return Err(CheckpointError::DType { found: format!("{:?}", view.dtype()), name });
-        }
-        let values: Vec<f32> =
-            view.data().as_chunks::<4>().0.iter().map(|word| f32::from_le_bytes(*word)).collect();
+        let values: Vec<f32> = match view.dtype() {
+            Dtype::F32 => view.data().as_chunks().0.iter().map(|word| f32::from_le_bytes(*word)).collect(),
+            Dtype::F16 => {
+                let word = |word: &[u8; 2]| half::f16::from_le_bytes(*word).to_f32();
+                view.data().as_chunks().0.iter().map(word).collect()
+            }
+            other => return Err(CheckpointError::DType { found: format!("{other:?}"), name }),
+        };
         tensors.insert(name, Tensor::from_vec(values, view.shape(), &Device::Cpu)?);
     }
     Ok(tensors)

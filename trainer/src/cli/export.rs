@@ -10,7 +10,7 @@ use clap::ValueEnum;
 use indicatif::{ProgressBar, ProgressStyle};
 use rcwm_models::bundle::{Bundle, PartName};
 use rcwm_models::tasks;
-use rcwm_trainer::checkpoint::Checkpoint;
+use rcwm_trainer::checkpoint::{Checkpoint, CheckpointError, SETTINGS_FILE};
 use rcwm_trainer::export::{self, ExportError, Options, Progress};
 use serde::Serialize;
 
@@ -18,7 +18,8 @@ use serde::Serialize;
 #[derive(Debug, clap::Args)]
 #[command(after_help = "Examples:
   rcwm-trainer export --checkpoint runs/untrained --out bundles/untrained
-  rcwm-trainer export --checkpoint runs/hammer --out bundles/hammer --task hammer --force")]
+  rcwm-trainer export --checkpoint runs/hammer --out bundles/hammer --task hammer --force
+  rcwm-trainer export --checkpoint runs/small/checkpoints/last --form checkpoint --half --out models/small")]
 pub struct Export {
     /// Folder of the checkpoint
     #[arg(long, value_name = "DIR")]
@@ -32,6 +33,12 @@ pub struct Export {
     /// Which parts: all, or only those without which there is no policy
     #[arg(long, value_enum, default_value = "all")]
     parts: Parts,
+    /// What to write: a bundle for the runtime, or a checkpoint without the optimisers' state to start from elsewhere
+    #[arg(long, value_enum, default_value = "bundle")]
+    form: Form,
+    /// Round weights to what 16 bits hold: a checkpoint takes half the space, a bundle compresses to half
+    #[arg(long)]
+    half: bool,
     /// Decisions a second the policy was trained for
     #[arg(long, default_value_t = 40.0)]
     rate_hz: f64,
@@ -60,6 +67,14 @@ enum Parts {
     Required,
 }
 
+#[derive(Debug, Clone, Copy, PartialEq, Eq, ValueEnum)]
+enum Form {
+    /// ONNX parts, manifest and golden values.
+    Bundle,
+    /// Weights and settings.
+    Checkpoint,
+}
+
 #[derive(Serialize)]
 struct Outcome<'a> {
     bundle: &'a PathBuf,
@@ -79,7 +94,13 @@ impl Export {
         if self.task != tasks::task_name(tasks::OWN_TASK) {
             tasks::task_id(&self.task).with_context(|| "--task")?;
         }
-        let checkpoint = Checkpoint::read(&self.checkpoint, &Device::Cpu)?;
+        let mut checkpoint = Checkpoint::read(&self.checkpoint, &Device::Cpu)?;
+        if self.half {
+            checkpoint = checkpoint.rounded()?;
+        }
+        if self.form == Form::Checkpoint {
+            return self.checkpoint(&checkpoint);
+        }
         let options = Options {
             task: self.task.clone(),
             rate_hz: self.rate_hz,
@@ -97,6 +118,15 @@ impl Export {
         let bundle = export::write(&checkpoint, &self.out, &options, &bar);
         bar.bar.finish_and_clear();
         self.summarise(&bundle?)?;
+        Ok(ExitCode::SUCCESS)
+    }
+
+    fn checkpoint(&self, checkpoint: &Checkpoint) -> Result<ExitCode> {
+        if !self.force && self.out.join(SETTINGS_FILE).exists() {
+            return Err(CheckpointError::Exists { path: self.out.clone() }.into());
+        }
+        checkpoint.write(&self.out)?;
+        println!("checkpoint of {} updates in {}", checkpoint.settings.updates, self.out.display());
         Ok(ExitCode::SUCCESS)
     }
 
