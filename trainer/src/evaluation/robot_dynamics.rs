@@ -4,7 +4,7 @@ use candle_core::Device;
 use serde::{Deserialize, Serialize};
 
 use super::open_loop::{filtered, imagined, joined};
-use super::{EvaluationError, Film, TaskTrajectories, Trace, traces};
+use super::{EvaluationError, Film, Measure, TaskTrajectories, Trace, traces};
 use crate::model::agent::Agent;
 use crate::model::latent::{Sampler, State};
 
@@ -55,6 +55,14 @@ pub struct Measured {
     pub posterior: Vec<Trace>,
     /// Films of the first trajectories.
     pub films: Vec<Film>,
+}
+
+impl Measured {
+    /// Mean robot dynamics error of every imagined trajectory.
+    #[must_use]
+    pub fn robot_errors(&self) -> Vec<Option<f64>> {
+        self.imagined.iter().map(|trace| trace.mean(Measure::RobotError)).collect()
+    }
 }
 
 /// Measures a frozen agent on a task's trajectories; `seen` hears of every trajectory.
