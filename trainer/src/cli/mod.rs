@@ -11,6 +11,7 @@ mod online;
 mod parameters;
 mod parity;
 mod pretrain;
+mod report;
 mod train;
 
 use std::path::Path;

@@ -9,7 +9,9 @@ use super::open_loop::{filtered, joined};
 use super::{EvaluationError, Film, Latents, TaskTrajectories};
 use crate::model::agent::Agent;
 use crate::model::latent::Sampler;
-use crate::plots::{COLOURS, Colour, INK, Line, PAPER, Panel, PlotError, Scale, text_width, write_png, write_text};
+use crate::plots::{
+    COLOURS, Colour, INK, Line, PAPER, Panel, PlotError, Scale, text_width, write_png, write_text,
+};
 
 /// Rows of pictures above the maps.
 const SHOWN: [&str; 4] = ["true", "imagined", "robot", "environment"];

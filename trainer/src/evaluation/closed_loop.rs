@@ -183,7 +183,8 @@ pub fn recorded_episode(
     let share = number..number + 1;
     run(bundle, &settings, std::slice::from_ref(&share), Some(folder.path()), stop, &mut |_| ())?;
     let entries = std::fs::read_dir(folder.path()).map_err(ClosedLoopError::Folder)?;
-    let file = entries.flatten().map(|entry| entry.path()).find(|path| path.extension() == Some("npz".as_ref()));
+    let file =
+        entries.flatten().map(|entry| entry.path()).find(|path| path.extension() == Some("npz".as_ref()));
     Ok(Episode::read(&file.ok_or(ClosedLoopError::Unrecorded { number })?)?)
 }
 
@@ -201,8 +202,9 @@ fn run(
     let folder = tempfile::tempdir().map_err(ClosedLoopError::Folder)?;
     let domain = Domain::new();
     let place = Place { bundle, folder: folder.path(), record };
-    let start =
-        |(number, share): (usize, &Range<u64>)| Pair::start(&programs, &place, settings, &domain, number, share);
+    let start = |(number, share): (usize, &Range<u64>)| {
+        Pair::start(&programs, &place, settings, &domain, number, share)
+    };
     let mut pairs = shares.iter().enumerate().map(start).collect::<Result<Vec<_>, _>>()?;
     loop {
         if stop.load(Ordering::Relaxed) {

@@ -27,7 +27,9 @@ mod statistics;
 mod trajectories;
 
 pub use attention::{Attention, AttentionFilm};
-pub use closed_loop::{ClosedLoopError, ClosedLoopReport, ClosedLoopSettings, Position, closed_loop, recorded_episode};
+pub use closed_loop::{
+    ClosedLoopError, ClosedLoopReport, ClosedLoopSettings, Position, closed_loop, recorded_episode,
+};
 pub use film::Film;
 pub use measures::{Measure, Trace, traces};
 pub use open_loop::{filtered, imagined, joined, open_loop};

@@ -116,10 +116,7 @@ impl TaskReport {
         // The same draws for every model.
         let bootstrap = Bootstrap::new(&task.numbers(), seed);
         let all = |traces: &[Trace]| {
-            Measure::ALL
-                .iter()
-                .map(|measure| (*measure, Series::of(traces, *measure, &bootstrap)))
-                .collect()
+            Measure::ALL.iter().map(|measure| (*measure, Series::of(traces, *measure, &bootstrap))).collect()
         };
         Self {
             task: task.task.clone(),
@@ -141,7 +138,9 @@ impl TaskReport {
             title: models.first().map_or_else(String::new, |(_, report)| report.task.clone()),
             x_label: format!("imagined steps; {}", measure.title()),
             scale: Scale::Linear,
-            lines: lines.map(|((name, report), colour)| line(name, *colour, &report.imagined[&measure])).collect(),
+            lines: lines
+                .map(|((name, report), colour)| line(name, *colour, &report.imagined[&measure]))
+                .collect(),
             marks: Vec::new(),
         }
     }
@@ -245,8 +244,7 @@ fn table_row(model: &str, name_width: usize, task: &TaskReport) -> String {
     let error = imagined(Measure::RobotError);
     let range =
         error.interval.map_or_else(String::new, |i| format!(" ({:.3} to {:.3})", i.low * 1e3, i.high * 1e3));
-    let overlap =
-        [imagined(Measure::MaskIou), &task.posterior[&Measure::MaskIou]].map(|x| mean(x, 1.0, 3));
+    let overlap = [imagined(Measure::MaskIou), &task.posterior[&Measure::MaskIou]].map(|x| mean(x, 1.0, 3));
     format!(
         "{:18} {model:name_width$} {:>27} {:>10} {:>15} {:>15} {:>10}",
         task.task,

@@ -21,6 +21,17 @@ pub enum Latents {
     Mode,
 }
 
+impl Latents {
+    /// Its name in files and on the command line.
+    #[must_use]
+    pub const fn name(self) -> &'static str {
+        match self {
+            Self::Sample => "sample",
+            Self::Mode => "mode",
+        }
+    }
+}
+
 /// How models are measured.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields, default)]

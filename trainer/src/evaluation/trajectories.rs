@@ -1,8 +1,8 @@
 use std::sync::Arc;
 
 use candle_core::Device;
-use rand::{Rng, SeedableRng};
 use rand::seq::{SliceRandom, index};
+use rand::{Rng, SeedableRng};
 use rand_chacha::ChaCha8Rng;
 use rcwm_models::episode::Episode;
 

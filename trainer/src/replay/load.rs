@@ -1,10 +1,12 @@
+use std::fmt::Write as _;
 use std::fs;
 use std::io;
 use std::path::{Path, PathBuf};
 
 use ndarray::Array3;
 use rcwm_models::IMAGE_SIDE;
-use rcwm_models::episode::{Episode, EpisodeError};
+use rcwm_models::episode::{EPISODE_BYTES_MAX, Episode, EpisodeError};
+use rcwm_models::files::{FileError, read_capped, sha256_hex};
 
 use super::{Replay, ReplayError};
 
@@ -25,6 +27,9 @@ pub enum LoadError {
         /// The folder.
         path: PathBuf,
     },
+    /// A file could not be read.
+    #[error("data: {0}")]
+    File(#[from] FileError),
     /// An episode's file is unusable.
     #[error("data: {0}")]
     Episode(#[from] EpisodeError),
@@ -91,6 +96,47 @@ impl Folder {
         Ok(Self { files, masks: masks.map(Path::to_path_buf) })
     }
 
+    /// The same episodes, task by task.
+    #[must_use]
+    pub fn by_task(&self) -> Vec<(String, Self)> {
+        let mut tasks: Vec<(String, Self)> = Vec::new();
+        for (task, file) in &self.files {
+            let entry = (task.clone(), file.clone());
+            match tasks.iter_mut().find(|(name, _)| name == task) {
+                Some((_, folder)) => folder.files.push(entry),
+                None => tasks.push((task.clone(), Self { files: vec![entry], masks: self.masks.clone() })),
+            }
+        }
+        tasks
+    }
+
+    /// One checksum of all episodes: of the names and contents of their files, and of their masks where these are pictures.
+    ///
+    /// # Errors
+    /// [`LoadError::Folder`] or [`LoadError::File`].
+    pub fn sha256(&self) -> Result<String, LoadError> {
+        let mut sums = String::new();
+        let mut add = |path: &Path| -> Result<(), LoadError> {
+            let bytes = read_capped(path, EPISODE_BYTES_MAX)?;
+            let _ = writeln!(sums, "{} {}", sha256_hex(&bytes), name_of(path));
+            Ok(())
+        };
+        for (task, path) in &self.files {
+            add(path)?;
+            let folder = self.masks.as_ref().map(|masks| masks_of(masks, task, path));
+            for picture in folder
+                .filter(|folder| folder.is_dir())
+                .map(|folder| sorted(&folder))
+                .transpose()?
+                .iter()
+                .flatten()
+            {
+                add(picture)?;
+            }
+        }
+        Ok(sha256_hex(sums.as_bytes()))
+    }
+
     /// Number of episodes.
     #[must_use]
     pub fn len(&self) -> usize {
@@ -120,7 +166,7 @@ impl Folder {
     fn read(&self, task: &str, path: &Path) -> Result<Episode, LoadError> {
         let mut episode = Episode::read(path)?;
         if let Some(masks) = &self.masks {
-            let folder = masks.join(task).join(path.file_stem().unwrap_or_default());
+            let folder = masks_of(masks, task, path);
             if folder.is_dir() {
                 episode.robot_mask = Some(read_masks(&folder, episode.len())?);
             }
@@ -157,6 +203,11 @@ impl Folder {
         }
         Ok(replay)
     }
+}
+
+/// Where the masks of an episode's file are, if they are pictures.
+fn masks_of(masks: &Path, task: &str, path: &Path) -> PathBuf {
+    masks.join(task).join(path.file_stem().unwrap_or_default())
 }
 
 fn sorted(folder: &Path) -> Result<Vec<PathBuf>, LoadError> {
