@@ -81,7 +81,10 @@ impl Inputs<'_> {
             super::write_json(json, &report)?;
         }
         let page = folder.join("index.html");
-        println!("{measured} parts measured, {found} were there; the page is {}", page.display());
+        match measured + found {
+            0 => println!("drawn anew: {}", page.display()),
+            _ => println!("{measured} parts measured, {found} were there; the page is {}", page.display()),
+        }
         outcome.with_context(|| "what was measured is kept, the same command goes on")
     }
 }

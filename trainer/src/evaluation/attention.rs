@@ -116,10 +116,10 @@ impl AttentionFilm {
         let top_of_maps = WORDS_HEIGHT + SHOWN.len() as u32 * (CELL + GAP) + GAP;
         let map_height = self.keys as u32 * self.pixel() + PART_GAP;
         let height = top_of_maps + map_height + 2 * WORDS_HEIGHT + SCALE_SIZE.1;
-        let width = (left + shown.len() as u32 * (CELL + GAP)).max(left + SCALE_SIZE.0 + CELL);
+        let width = (left + shown.len() as u32 * (CELL + GAP)).max(left + SCALE_SIZE.0 + 2 * CELL);
         let mut strip = RgbImage::from_pixel(width, height, Rgb(PAPER));
         self.write_titles(&mut strip, top_of_maps)?;
-        let most = self.maps.iter().map(|map| largest(map)).fold(0.0, f32::max);
+        let range = self.range();
         for (column, step) in shown.into_iter().enumerate() {
             let (x, t) = (left + column as u32 * (CELL + GAP), self.context + step);
             write_text(&mut strip, (x as i32, 3), LETTERS, INK, &self.film.describe(t))?;
@@ -128,9 +128,9 @@ impl AttentionFilm {
                     self.film.draw(&mut strip, (x, WORDS_HEIGHT + row as u32 * (CELL + GAP)), panel, t);
                 }
             }
-            self.draw_map(&mut strip, (x, top_of_maps), &self.maps[step], most);
+            self.draw_map(&mut strip, (x, top_of_maps), &self.maps[step], range);
         }
-        self.draw_scale(&mut strip, (left, top_of_maps + map_height + WORDS_HEIGHT / 2), most)?;
+        self.draw_scale(&mut strip, (left, top_of_maps + map_height + WORDS_HEIGHT / 2), range)?;
         Ok(strip)
     }
 
@@ -159,39 +159,54 @@ impl AttentionFilm {
         Ok(())
     }
 
-    fn draw_map(&self, on: &mut RgbImage, (left, top): (u32, u32), map: &[f32], most: f32) {
+    /// Least and largest weight of the whole film: attention is often nearly even, and colours from 0 on would hide what there is.
+    fn range(&self) -> (f32, f32) {
+        let weights = || self.maps.iter().flatten().copied();
+        let (least, most) = (weights().fold(f32::INFINITY, f32::min), weights().fold(0.0, f32::max));
+        (least, most.max(least + f32::EPSILON))
+    }
+
+    fn draw_map(&self, on: &mut RgbImage, (left, top): (u32, u32), map: &[f32], (least, most): (f32, f32)) {
         let pixel = self.pixel();
         for (query, weights) in map.chunks_exact(self.keys).enumerate() {
             for (key, weight) in weights.iter().enumerate() {
                 let gap = if key < self.queries { 0 } else { PART_GAP };
                 let (x, y) = (left + query as u32 * pixel, top + gap + key as u32 * pixel);
-                fill(on, (x, y), (pixel, pixel), colour(weight / most));
+                fill(on, (x, y), (pixel, pixel), colour((weight - least) / (most - least)));
             }
         }
     }
 
-    /// The colours from 0 to the largest weight, with a mark where every row gets the same.
-    fn draw_scale(&self, on: &mut RgbImage, (left, top): (u32, u32), most: f32) -> Result<(), PlotError> {
-        let (width, height) = SCALE_SIZE;
-        for x in 0..width {
-            fill(on, (left + x, top), (1, height), colour(x as f32 / (width - 1) as f32));
+    /// The colours from the least to the largest weight, with a mark where every row gets the same.
+    fn draw_scale(
+        &self,
+        on: &mut RgbImage,
+        (left, top): (u32, u32),
+        (least, most): (f32, f32),
+    ) -> Result<(), PlotError> {
+        let ((width, height), below) = (SCALE_SIZE, (top + SCALE_SIZE.1 + 4) as i32);
+        let words = |value: f32| format!("{value:.4}");
+        let mut x = left;
+        write_text(on, (x as i32, top as i32), LETTERS, INK, &words(least))?;
+        x += text_width(LETTERS, &words(least))? + 2 * GAP;
+        for step in 0..width {
+            fill(on, (x + step, top), (1, height), colour(step as f32 / (width - 1) as f32));
         }
         let even = 1.0 / self.keys as f32;
-        let mark = left + ((even / most) * (width - 1) as f32).round().clamp(0.0, (width - 1) as f32) as u32;
+        let place = ((even - least) / (most - least)).clamp(0.0, 1.0) * (width - 1) as f32;
+        let mark = x + place.round() as u32;
         fill(on, (mark, top), (1, height + 4), INK);
-        let words = [(left, "0".to_owned()), (mark, format!("{even:.3}: even"))];
-        for (x, text) in words {
-            write_text(on, (x as i32, (top + height + 4) as i32), LETTERS, INK, &text)?;
-        }
-        let beside = ((left + width + 2 * GAP) as i32, top as i32);
-        write_text(on, beside, LETTERS, INK, &format!("{most:.3}: largest"))
+        write_text(on, (mark as i32, below), LETTERS, INK, &format!("{}: even", words(even)))?;
+        let beside = (x + width + 2 * GAP) as i32;
+        write_text(on, (beside, top as i32), LETTERS, INK, &words(most))
     }
 }
 
 impl Attention {
-    /// How much of the attention goes to h, and the largest weight, over the imagined steps.
+    /// Over the imagined steps: how much of the attention goes to h, and the largest weight; both beside what they are if every row gets
+    /// the same.
     #[must_use]
-    pub fn panel(&self, title: &str) -> Panel {
+    pub fn panels(&self) -> [Panel; 2] {
         let line = |label: &str, values: &[f64], colour: Colour| Line {
             label: label.to_owned(),
             colour,
@@ -199,20 +214,18 @@ impl Attention {
             band: None,
             faint: false,
         };
-        let even = self.rows_of_h as f64 / self.keys as f64;
-        let mut lines = vec![
-            line("share of h", &self.share_of_h, COLOURS[0]),
-            line("largest weight", &self.largest, COLOURS[1]),
-        ];
-        let evenly = line("share of h if even", &vec![even; self.share_of_h.len()], COLOURS[5]);
-        lines.push(Line { faint: true, ..evenly });
-        Panel {
+        let panel = |title: &str, values: &[f64], even: f64, colour: Colour| Panel {
             title: title.to_owned(),
-            x_label: "imagined steps; attention".to_owned(),
+            x_label: "imagined steps".to_owned(),
             scale: Scale::Linear,
-            lines,
+            lines: vec![line("even", &vec![even; values.len()], COLOURS[5]), line("found", values, colour)],
             marks: Vec::new(),
-        }
+        };
+        let (rows, keys) = (self.rows_of_h as f64, self.keys as f64);
+        [
+            panel("share of h", &self.share_of_h, rows / keys, COLOURS[0]),
+            panel("largest weight", &self.largest, 1.0 / keys, COLOURS[1]),
+        ]
     }
 }
 

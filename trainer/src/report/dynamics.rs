@@ -3,7 +3,7 @@ use std::sync::atomic::AtomicBool;
 use candle_core::Device;
 use serde::{Deserialize, Serialize};
 
-use super::{Draft, Measurement, ReportError};
+use super::{Draft, Measurement, ReportError, shown_words};
 use crate::checkpoint::{Checkpoint, CheckpointSettings};
 use crate::evaluation::{
     Attention, AttentionFilm, Latents, OpenLoopSettings, TaskReport, TaskTrajectories, measure,
@@ -110,7 +110,8 @@ impl Subject {
     /// # Errors
     /// [`ReportError::Checkpoint`].
     pub fn new(name: &str, checkpoint: &Checkpoint) -> Result<Self, ReportError> {
-        let settings = checkpoint.settings.clone();
+        let data = shown_words(&checkpoint.settings.data);
+        let settings = CheckpointSettings { data, ..checkpoint.settings.clone() };
         let agent = Agent::new(&checkpoint.parameters.frozen(), &settings.model)
             .map_err(crate::checkpoint::CheckpointError::from)?;
         Ok(Self { name: name.to_owned(), settings, agent })

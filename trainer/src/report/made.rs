@@ -63,6 +63,16 @@ pub fn shown_path(word: &str) -> String {
     format!("…/{}", last.display())
 }
 
+/// Words in which paths may stand, with those as [`shown_path`] has them.
+#[must_use]
+pub fn shown_words(text: &str) -> String {
+    let word = |word: &str| {
+        let path = word.trim_end_matches([',', ';', ':', '.']);
+        shown_path(path) + &word[path.len()..]
+    };
+    text.split(' ').map(word).collect::<Vec<_>>().join(" ")
+}
+
 #[cfg(test)]
 mod tests {
     use super::*;
@@ -73,6 +83,7 @@ mod tests {
         assert_eq!(shown_path("--seed"), "--seed");
         assert_eq!(shown_path("/home/me/runs/hammer/checkpoints/last"), "…/hammer/checkpoints/last");
         assert_eq!(shown_path("/tmp/a"), "…/a");
+        assert_eq!(shown_words("weights: /a/b/c; golden values: 32"), "weights: …/b/c; golden values: 32");
         let here = std::env::current_dir().unwrap().join("models");
         assert_eq!(shown_path(&here.display().to_string()), "models");
     }

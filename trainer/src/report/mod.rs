@@ -25,7 +25,7 @@ mod sections;
 mod success;
 
 pub use dynamics::{AttentionPart, AttentionSource, Dynamics, DynamicsSource, Subject, UNDISTURBED};
-pub use made::{Made, shown_path};
+pub use made::{Made, shown_path, shown_words};
 pub use page::Report;
 pub use parts::{Draft, Measurement, Part, Store};
 pub use results::{ResultEntry, Results, ResultsSource};

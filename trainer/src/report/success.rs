@@ -10,7 +10,7 @@ use rcwm_models::settings::ModelSettings;
 use rcwm_models::tasks::task_id;
 use serde::{Deserialize, Serialize};
 
-use super::{Draft, Measurement, ReportError};
+use super::{Draft, Measurement, ReportError, shown_words};
 use crate::evaluation::{
     ClosedLoopReport, ClosedLoopSettings, Interval, Position, closed_loop, recorded_episode,
 };
@@ -250,7 +250,9 @@ fn policy(folder: &Path, place: &Path) -> Result<Result<Policy, String>, ReportE
     } else {
         return Ok(Err(format!("{own}: neither its folder nor its manifest names a task")));
     };
-    let (model, provenance) = (manifest.model, manifest.provenance);
+    let model = manifest.model;
+    let data = shown_words(&manifest.provenance.data);
+    let provenance = Provenance { data, ..manifest.provenance };
     Ok(Ok(Policy { name, task, folder: place.to_path_buf(), sha256, model, provenance }))
 }
 

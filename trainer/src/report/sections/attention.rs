@@ -14,8 +14,8 @@ pub(super) fn section(report: &Report) -> Result<Markup, ReportError> {
         p {
             "The interaction's cross-attention while a trajectory is imagined from its beginning. Columns are the categoricals of the \
              environment's last z, which ask; rows answer: above the categoricals of the robot's predicted z, below the rows made of its \
-             h. The weights of a column sum to 1. The colours go from 0 to the film's largest weight; the mark shows what every row \
-             would get if all got the same."
+             h. The weights of a column sum to 1. The colours go from the film's least weight to its largest; the mark shows \
+             what every row would get if all got the same."
         }
         @for film in films { (film) }
     })
@@ -28,6 +28,7 @@ fn film(report: &Report, part: &Part<AttentionPart>) -> Result<Markup, ReportErr
     let mean = |values: &[f64]| values.iter().sum::<f64>() / values.len().max(1) as f64;
     let even = found.rows_of_h as f64 / found.keys.max(1) as f64;
     let imagined = found.share_of_h.len();
+    let plots = found.panels().iter().map(plot).collect::<Result<Vec<_>, _>>()?;
     Ok(html! {
         h3 { (title) }
         figure {
@@ -38,6 +39,6 @@ fn film(report: &Report, part: &Part<AttentionPart>) -> Result<Markup, ReportErr
                 (format!("{even:.3}")) " if all rows got the same)."
             }
         }
-        div.plots { (plot(&found.panel(&title))?) }
+        div.plots { @for plot in plots { (plot) } }
     })
 }

@@ -82,7 +82,9 @@ fn dynamics(report: &Report) -> Result<Markup, ReportError> {
     let disturbed = report.dynamics.iter().filter(|part| part.source.disturb != UNDISTURBED);
     let tasks: Vec<&str> = disturbed.map(|part| part.source.task.as_str()).collect();
     let shown = report.dynamics.iter().filter(|part| tasks.contains(&part.source.task.as_str()));
-    let rows: Vec<_> = shown.map(|part| row(report, part)).collect();
+    let mut shown: Vec<_> = shown.collect();
+    shown.sort_by_key(|part| (&part.source.task, &part.source.model, part.source.disturb != UNDISTURBED));
+    let rows: Vec<_> = shown.into_iter().map(|part| row(report, part)).collect();
     let mut plots = Vec::new();
     for kind in &kinds {
         let compared: Vec<_> = report.comparisons.iter().filter(|found| found.disturb == *kind).collect();

@@ -53,7 +53,7 @@ pub(super) fn strips(report: &Report) -> Result<Markup, ReportError> {
         for file in &part.pictures {
             let title = format!("{}, {}", part.source.task, part.source.model);
             figures.push(html! {
-                figure { div.strip { (report.picture(file, "", &title)?) } figcaption { (title) } }
+                h3 { (title) } figure { div.strip { (report.picture(file, "", &title)?) } }
             });
         }
     }

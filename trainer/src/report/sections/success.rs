@@ -109,7 +109,11 @@ pub(super) fn film_of(report: &Report, part: &Part<Success>) -> Result<Markup, R
         let Some(file) = part.pictures.get(film.picture) else { continue };
         let ended =
             film.solved_at.map_or_else(|| "not solved".to_owned(), |step| format!("solved at step {step}"));
-        let title = format!("{}, {}, episode {}", part.source.task, part.source.policy, film.episode);
+        let source = &part.source;
+        let mut title = format!("{}, {}, episode {}", source.task, source.policy, film.episode);
+        if source.disturb != UNDISTURBED {
+            title = format!("{}: {title}", source.disturb);
+        }
         figures.push(html! {
             figure { (report.picture(file, "film", &title)?) figcaption { (title) ": " (ended) } }
         });
