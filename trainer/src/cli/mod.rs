@@ -39,7 +39,7 @@ enum Verb {
     Parity(parity::Parity),
     Init(init::Init),
     Export(export::Export),
-    Evaluate(evaluate::Evaluate),
+    Evaluate(Box<evaluate::Evaluate>),
     Pretrain(pretrain::Pretrain),
     Fewshot(fewshot::Fewshot),
     Finetune(finetune::Finetune),

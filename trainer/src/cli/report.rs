@@ -4,7 +4,7 @@ use std::path::{Path, PathBuf};
 use std::sync::atomic::{AtomicBool, Ordering};
 use std::time::{Duration, Instant};
 
-use anyhow::{Context, Result, ensure};
+use anyhow::{Result, ensure};
 use candle_core::Device;
 use indicatif::{ProgressBar, ProgressStyle};
 use rcwm_trainer::checkpoint::Checkpoint;
@@ -85,7 +85,8 @@ impl Inputs<'_> {
             0 => println!("drawn anew: {}", page.display()),
             _ => println!("{measured} parts measured, {found} were there; the page is {}", page.display()),
         }
-        outcome.with_context(|| "what was measured is kept, the same command goes on")
+        ensure!(outcome.is_ok(), "interrupted; what was measured is kept, the same command goes on");
+        Ok(())
     }
 }
 
@@ -219,38 +220,44 @@ impl Work<'_> {
 
     /// What is missing of one task.
     fn task(&mut self, data: &TaskData, subjects: &[Subject], bar: &ProgressBar) -> Result<()> {
-        let settings = self.inputs.open_loop;
         let mut replay = None;
         for subject in subjects {
-            let source = subject.source(&data.task, &data.disturb, &data.sha256, &settings);
-            if self.store.find::<Dynamics>(&source).is_some() {
-                self.found += 1;
-                continue;
-            }
-            let Some(replay) = self.loaded(&mut replay, data)? else { return Ok(()) };
-            bar.set_message(format!("{} on {}, disturbance {}", subject.name, data.task, data.disturb));
-            let (begin, length) = (Instant::now(), settings.context + settings.imagined);
-            let chosen = TaskTrajectories::choose(replay, settings.trajectories, length, settings.seed)
-                .map_err(ReportError::from)?;
-            let mut draft = self.store.draft::<Dynamics>(&source)?;
-            let device = &self.inputs.device;
-            for task in &chosen {
-                let seen = |rows| bar.inc(rows as u64);
-                let found = subject.measure(task, &settings, device, &mut draft, self.stop, seen)?;
-                let short = settings.trajectories.saturating_sub(task.chosen.len());
-                bar.set_length(bar.length().unwrap_or(0).saturating_sub(short as u64));
-                let seconds = begin.elapsed().as_secs_f64();
-                self.store.keep(draft, source, found, self.made(), seconds)?;
-                self.measured += 1;
-                // A folder of one task holds one task.
-                break;
-            }
+            self.dynamics(data, subject, &mut replay, bar)?;
         }
         if data.disturb == UNDISTURBED {
             for subject in subjects.iter().filter(|subject| subject.has_attention()) {
                 self.attention(data, subject, &mut replay)?;
             }
         }
+        Ok(())
+    }
+
+    fn dynamics(
+        &mut self,
+        data: &TaskData,
+        subject: &Subject,
+        replay: &mut Option<Replay>,
+        bar: &ProgressBar,
+    ) -> Result<()> {
+        let (settings, device) = (self.inputs.open_loop, &self.inputs.device);
+        let source = subject.source(&data.task, &data.disturb, &data.sha256, &settings);
+        if self.store.find::<Dynamics>(&source).is_some() {
+            self.found += 1;
+            return Ok(());
+        }
+        let Some(replay) = self.loaded(replay, data)? else { return Ok(()) };
+        bar.set_message(format!("{} on {}, disturbance {}", subject.name, data.task, data.disturb));
+        let (begin, length) = (Instant::now(), settings.context + settings.imagined);
+        let chosen = TaskTrajectories::choose(replay, settings.trajectories, length, settings.seed)?;
+        // Folders are of one task each.
+        let Some(task) = chosen.first() else { return Ok(()) };
+        let mut draft = self.store.draft::<Dynamics>(&source)?;
+        let before = bar.position();
+        let found =
+            subject.measure(task, &settings, device, &mut draft, self.stop, |rows| bar.inc(rows as u64))?;
+        bar.set_position(before + settings.trajectories as u64);
+        self.store.keep(draft, source, found, self.made(), begin.elapsed().as_secs_f64())?;
+        self.measured += 1;
         Ok(())
     }
 
