@@ -121,3 +121,26 @@ fn choose(episodes: &[&Arc<Episode>], count: usize, length: usize, seed: u64) ->
     chosen.shuffle(&mut random);
     chosen
 }
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_whole_trajectory_begins_an_episode_that_was_solved() {
+        let mut replay = Replay::new(usize::MAX);
+        for (steps, solved) in [(30, false), (20, true), (30, true), (5, true)] {
+            let mut episode = Episode::blank(steps);
+            episode.robot_mask = Some(ndarray::Array3::from_elem((steps, 64, 64), false));
+            episode.success[steps - 1] = solved;
+            replay.add("hammer", episode).unwrap();
+        }
+        for seed in 0..10 {
+            let found = TaskTrajectories::whole(&replay, "hammer", 25, seed).unwrap();
+            assert_eq!((found.length, found.chosen[0].start, found.numbers()), (25, 0, vec![2]));
+        }
+        let longest = TaskTrajectories::whole(&replay, "hammer", 99, 0).unwrap();
+        assert_eq!(longest.length, 30, "as long as there are");
+        assert!(TaskTrajectories::whole(&replay, "reach", 25, 0).is_none());
+    }
+}

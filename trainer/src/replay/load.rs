@@ -301,4 +301,26 @@ mod tests {
         let folder = tempfile::tempdir().unwrap();
         assert!(matches!(Folder::list(folder.path(), None), Err(LoadError::NoEpisodes { .. })));
     }
+
+    #[test]
+    fn a_checksum_is_of_one_task_and_changes_with_its_episodes() {
+        let folder = tempfile::tempdir().unwrap();
+        let write = |task: &str, name: &str| {
+            fs::create_dir_all(folder.path().join(task)).unwrap();
+            episode(3, 1.0).write(&folder.path().join(task).join(name)).unwrap();
+        };
+        let sums = || -> Vec<(String, String)> {
+            let tasks = Folder::list(folder.path(), None).unwrap().by_task();
+            tasks.into_iter().map(|(task, folder)| (task, folder.sha256().unwrap())).collect()
+        };
+        write("hammer", "a.npz");
+        write("reach", "a.npz");
+        let before = sums();
+        assert_eq!((before.len(), before[0].0.as_str()), (2, "hammer"));
+        assert_eq!(sums(), before);
+        write("reach", "b.npz");
+        let after = sums();
+        assert_eq!(after[0], before[0], "the other task is as it was");
+        assert_ne!(after[1].1, before[1].1);
+    }
 }

@@ -29,7 +29,7 @@ pub use made::{Made, shown_path, shown_words};
 pub use page::Report;
 pub use parts::{Draft, Measurement, Part, Store};
 pub use results::{ResultEntry, Results, ResultsSource};
-pub use success::{Policy, Success, SuccessSource, Tick, policies};
+pub use success::{Policy, Success, SuccessFilm, SuccessSource, Tick, policies};
 
 use std::path::PathBuf;
 

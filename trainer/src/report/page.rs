@@ -141,3 +141,95 @@ fn compared(parts: &[Part<Dynamics>]) -> Vec<Compared> {
     }
     found
 }
+
+#[cfg(test)]
+mod tests {
+    use rcwm_models::bundle::Provenance;
+    use rcwm_models::settings::{ModelSettings, Preset};
+
+    use super::*;
+    use crate::evaluation::wilson;
+    use crate::report::{SuccessFilm, SuccessSource};
+
+    fn page(store: &Store) -> String {
+        Report::read(store, Made::now("cpu"), "rcwm-trainer evaluate --report r".into())
+            .unwrap()
+            .html()
+            .unwrap()
+    }
+
+    fn keep(store: &Store, policy: &str, solved: bool) {
+        let source = SuccessSource {
+            policy: policy.into(),
+            task: "hammer".into(),
+            bundle_sha256: "ab".into(),
+            disturb: "none".into(),
+            episodes: 1,
+            seed: 0,
+            steps_max: 5,
+            engine: "tract".into(),
+            sampled_by: None,
+        };
+        let mut draft = store.draft::<Success>(&source).unwrap();
+        std::fs::write(draft.picture("solved.gif"), b"GIF89a").unwrap();
+        let provenance = Provenance {
+            preset: "debug".into(),
+            data: "data".into(),
+            updates: 1,
+            seeds: vec![0],
+            source_revision: String::new(),
+        };
+        let success = Success {
+            episodes: 1,
+            successes: usize::from(solved),
+            interval: wilson(usize::from(solved), 1),
+            return_mean: 2.0,
+            return_std: 0.0,
+            returns: vec![2.0],
+            successful: vec![solved],
+            steps: 5,
+            tick: None,
+            fallback_answers: Some(0),
+            films: vec![SuccessFilm { episode: 0, solved_at: Some(3), picture: 0 }],
+            model: ModelSettings::preset(Preset::Debug, ModelKind::Rcwm),
+            provenance,
+        };
+        store.keep(draft, source, success, Made::now("cpu"), 1.0).unwrap();
+    }
+
+    #[test]
+    fn an_empty_report_says_what_adds_every_section() {
+        let folder = tempfile::tempdir().unwrap();
+        let page = page(&Store::open(folder.path()).unwrap());
+        assert_eq!(page.matches("no policy").count(), 12, "all tasks of the spec");
+        for option in ["--bundles", "--checkpoint", "--data", "--disturb ", "--disturbed-data", "--results"] {
+            assert!(page.contains(option), "{option}");
+        }
+    }
+
+    #[test]
+    fn a_policy_is_a_row_with_its_film_and_what_is_missing_says_so() {
+        let folder = tempfile::tempdir().unwrap();
+        let store = Store::open(folder.path()).unwrap();
+        keep(&store, "<b>evil</b>", true);
+        let page = page(&store);
+        assert!(page.contains("&lt;b&gt;evil&lt;/b&gt;") && !page.contains("<b>evil"));
+        assert!(page.contains("(1 of 1)") && page.contains("solved at step 3"));
+        assert!(page.contains("data:image/gif;base64,") && page.contains("missing"), "no latency was told");
+        assert_eq!(page.matches("no policy").count(), 11);
+    }
+
+    #[test]
+    fn a_report_is_written_with_its_numbers() {
+        let folder = tempfile::tempdir().unwrap();
+        let store = Store::open(folder.path()).unwrap();
+        keep(&store, "policy", false);
+        let report = Report::read(&store, Made::now("cpu"), String::new()).unwrap();
+        report.write(folder.path()).unwrap();
+        let text = std::fs::read(folder.path().join("report.json")).unwrap();
+        let json: serde_json::Value = serde_json::from_slice(&text).unwrap();
+        assert_eq!(json["success"][0]["measured"]["successful"], serde_json::json!([false]));
+        assert!(folder.path().join("index.html").is_file());
+        assert!(store.all::<Results>().unwrap().is_empty());
+    }
+}
