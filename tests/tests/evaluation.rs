@@ -80,6 +80,91 @@ fn ctrl_c_ends_simulators_and_runtimes_too() {
     assert_eq!(std::fs::read_dir(&scratch).unwrap().count(), 0, "the temporary bundle is gone");
 }
 
+/// A command that has ended well, and what it printed.
+fn done(command: Command) -> String {
+    let mut running = Running::start(command);
+    running.succeed();
+    running.printed()
+}
+
+/// An untrained bundle in a folder named after its task, and two recorded episodes with masks.
+fn inputs(domain: &Domain, folder: &Path, checkpoint: &Path) {
+    let mut export = domain.command("rcwm-trainer");
+    export.args(["export", "--task", "reach", "--golden-ticks", "1", "--checkpoint"]).arg(checkpoint);
+    export.arg("--out").arg(folder.join("bundles/reach"));
+    done(export);
+    let mut collect = domain.command("rcwm-trainer");
+    collect.args(["collect", "--task", "reach", "--expert", "2", "--masks", "2", "--steps-max", "16"]);
+    collect.args(["--simulators", "1", "--out"]).arg(folder.join("data"));
+    done(collect);
+}
+
+#[test]
+fn a_report_is_one_page_that_needs_nothing_else_and_measures_nothing_twice() {
+    let (domain, folder) = (Domain::new(), tempfile::tempdir().unwrap());
+    let models = ["rcwm", "vanilla"].map(|model| checkpoint(&domain, folder.path(), model));
+    inputs(&domain, folder.path(), &models[0]);
+    let place = folder.path().join("report");
+    let report = |inputs: bool| {
+        let mut command = domain.command("rcwm-trainer");
+        command.arg("evaluate").arg("--report").arg(&place);
+        if inputs {
+            for model in &models {
+                command.arg("--checkpoint").arg(model);
+            }
+            command.arg("--data").arg(folder.path().join("data"));
+            command.arg("--bundles").arg(folder.path().join("bundles"));
+            command.args(["--trajectories", "2", "--context", "3", "--imagined", "5"]);
+            command.args(["--episodes", "2", "--steps-max", "8", "--disturb", "noise"]);
+        }
+        done(command)
+    };
+    // Two models, one attention, a policy with and without disturbance.
+    let printed = report(true);
+    assert!(printed.contains("5 parts measured, 0 were there"), "{printed}");
+    let json = read_json(&place.join("report.json"));
+    assert_eq!(json["success"].as_array().unwrap().len(), 2);
+    assert_eq!(json["success"][0]["measured"]["episodes"], 2);
+    assert_eq!(json["success"][0]["measured"]["fallback_answers"], 0);
+    assert!(json["comparisons"][0]["ratio"].as_f64().is_some_and(|ratio| ratio > 0.0), "{json}");
+    // 16 decisions are 17 observations, of which 3 are seen.
+    assert_eq!(json["attention"][0]["measured"]["attention"]["share_of_h"].as_array().unwrap().len(), 14);
+    assert_self_contained(&place, folder.path());
+    // Nothing is measured twice, and without inputs the page is only drawn.
+    let printed = report(true);
+    assert!(printed.contains("0 parts measured, 5 were there"), "{printed}");
+    let printed = report(false);
+    assert!(printed.contains("drawn anew"), "{printed}");
+    let again = read_json(&place.join("report.json"));
+    for kind in ["success", "dynamics", "comparisons", "attention"] {
+        assert_eq!(again[kind], json[kind], "{kind}");
+    }
+    assert_self_contained(&place, folder.path());
+}
+
+/// The page loads nothing and neither file names a folder of this machine.
+fn assert_self_contained(report: &Path, folder: &Path) {
+    let page = std::fs::read_to_string(report.join("index.html")).unwrap();
+    let text = std::fs::read_to_string(report.join("report.json")).unwrap();
+    for source in page.split("src=\"").skip(1) {
+        assert!(source.starts_with("data:image/"), "{}", &source[..source.len().min(80)]);
+    }
+    for link in page.split("href=\"").skip(1) {
+        assert!(link.starts_with('#'), "{}", &link[..link.len().min(80)]);
+    }
+    for loads in ["<script", "<link", "@import", "url(", "http://", "https://"] {
+        assert!(!page.contains(loads), "{loads}");
+    }
+    let (folder, home) = (folder.to_string_lossy(), rcwm_tests::root().display().to_string());
+    for path in [folder.as_ref(), home.as_str()] {
+        assert!(!page.contains(path) && !text.contains(path), "{path}");
+    }
+    assert!(
+        page.contains("data:image/gif") && page.contains("no policy"),
+        "films, and tasks without a policy"
+    );
+}
+
 #[test]
 fn what_cannot_be_judged_is_one_clear_error() {
     let (domain, folder) = (Domain::new(), tempfile::tempdir().unwrap());

@@ -15,6 +15,7 @@
 //! | [`export`] | the bundle that a runtime deploys |
 //! | [`parity`] | our numbers against the authors' |
 //! | [`evaluation`] | what a model can do: open loop, robot dynamics, success |
+//! | [`report`] | what was measured, kept in parts and drawn as one page |
 //! | [`plots`] | charts, films and text as pictures |
 //!
 //! This crate never depends on tract or pyo3.
@@ -31,5 +32,6 @@ pub mod ops;
 pub mod parity;
 pub mod plots;
 pub mod replay;
+pub mod report;
 pub mod simulators;
 pub mod training;

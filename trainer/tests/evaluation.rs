@@ -163,12 +163,12 @@ fn a_report_compares_models_on_the_same_trajectories() {
     let itself = Comparison::of(task, ("a", &ours), ("b", &ours), 5).unwrap();
     assert_eq!((itself.ratio, itself.interval.unwrap().low, itself.interval.unwrap().high), (1.0, 1.0, 1.0));
     let comparison = Comparison::of(task, ("vanilla", &theirs), ("rcwm", &ours), 5).unwrap();
-    let mean = |model: usize| report.models[model].tasks[0].imagined["robot_error"].mean.unwrap();
+    let mean = |model: usize| report.models[model].tasks[0].imagined[&Measure::RobotError].mean.unwrap();
     assert!((comparison.ratio - mean(1) / mean(0)).abs() < 1e-12);
     report.comparisons.push(comparison);
     let table = report.table();
     assert!(table.contains("robot error of vanilla is") && table.lines().count() == 6, "{table}");
-    let series = &report.models[0].tasks[0].imagined["mask_iou"];
+    let series = &report.models[0].tasks[0].imagined[&Measure::MaskIou];
     assert_eq!(series.step_mean.len(), 8);
     let picture = report.plot(Measure::RobotError).unwrap();
     assert!(picture.width() > 300 && picture.height() > 200);

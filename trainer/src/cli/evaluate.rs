@@ -17,7 +17,10 @@ use rcwm_trainer::export::{self, ExportError, Options};
 use rcwm_trainer::model::agent::Agent;
 use rcwm_trainer::plots;
 use rcwm_trainer::replay::Folder;
+use rcwm_trainer::report::shown_path;
 use serde::Serialize;
+
+use super::report::{Inputs, ReportArguments};
 
 /// Judge models: robot dynamics on recorded episodes, or success in the simulator
 #[derive(Debug, clap::Args)]
@@ -28,19 +31,24 @@ use serde::Serialize;
   rcwm-trainer evaluate --checkpoint runs/hammer/checkpoints/best --task hammer --episodes 20
   rcwm-trainer evaluate --bundle bundles/hammer --task hammer --episodes 20 --disturb textures \\
       --simulators 2
+  rcwm-trainer evaluate --report report --bundles models/bundles --episodes 50 --checkpoint \
+      runs/small/checkpoints/last --checkpoint runs/vanilla/checkpoints/last --data data/unseen
+  rcwm-trainer evaluate --report report        (draws the page anew)
 
 With --data (paper, Fig. 4 and 7): every model sees some steps of the same trajectories and
 imagines the rest with the recorded actions. The robot dynamics error is the squared error between
 imagined and true picture, both multiplied by the true robot mask, mean over the whole picture;
 the episodes need masks. With --task: the policy is exported and deployed by rcwm-runtime in
-rcwm-simulator, in lock-step.")]
-#[command(group = clap::ArgGroup::new("on").required(true).args(["data", "tasks"]))]
+rcwm-simulator, in lock-step. With --report: both, as one page that shows all that lies in the
+folder's parts; a part is measured again only if it is asked for from something else. Ctrl-C keeps
+what is done.")]
+#[command(group = clap::ArgGroup::new("on").required(true).multiple(true).args(["data", "tasks", "report"]))]
 pub struct Evaluate {
     /// Folder of a checkpoint (repeatable with --data: the later ones are compared with the first)
-    #[arg(long = "checkpoint", value_name = "DIR", required_unless_present = "bundle")]
+    #[arg(long = "checkpoint", value_name = "DIR", required_unless_present_any = ["bundle", "report"])]
     checkpoints: Vec<PathBuf>,
     /// Folder of recorded episodes with masks, one sub-folder a task
-    #[arg(long, value_name = "DIR")]
+    #[arg(long, value_name = "DIR", conflicts_with = "tasks")]
     data: Option<PathBuf>,
     /// Folder of masks as pictures, task/episode/*.png, in place of the episodes' own
     #[arg(long, value_name = "DIR", requires = "data")]
@@ -57,9 +65,9 @@ pub struct Evaluate {
     /// Take the most probable latents and actions, or draw them [default: sample with --data, mode with --task]
     #[arg(long, value_enum)]
     latents: Option<LatentsName>,
-    /// Films a task and model, written to --out
-    #[arg(long, default_value_t = 2, value_name = "N")]
-    films: usize,
+    /// Films a task and model, written to --out, or strips in a report [default: 2, in a report 1]
+    #[arg(long, value_name = "N")]
+    films: Option<usize>,
     /// Folder for plots and films
     #[arg(long, value_name = "DIR", requires = "data")]
     out: Option<PathBuf>,
@@ -75,9 +83,9 @@ pub struct Evaluate {
     /// Decisions in an episode
     #[arg(long, default_value_t = 250, value_name = "N", value_parser = clap::value_parser!(u32).range(1..=250))]
     steps_max: u32,
-    /// Visual disturbance
+    /// Visual disturbance (repeatable; a report always has none too)
     #[arg(long, default_value = "none", value_parser = ["none", "textures", "noise"])]
-    disturb: String,
+    disturb: Vec<String>,
     /// The runtime's engine
     #[arg(long, default_value = "tract", value_parser = ["tract", "ort"])]
     engine: String,
@@ -99,6 +107,8 @@ pub struct Evaluate {
     /// Write what was measured as JSON
     #[arg(long, value_name = "FILE")]
     json: Option<PathBuf>,
+    #[command(flatten)]
+    report: ReportArguments,
 }
 
 #[derive(Debug, Clone, Copy, PartialEq, Eq, clap::ValueEnum)]
@@ -112,30 +122,52 @@ enum LatentsName {
 impl Evaluate {
     pub fn run(self) -> Result<ExitCode> {
         let stop = super::stop_on_ctrl_c()?;
-        match &self.data {
-            Some(data) => self.open_loop(data, &stop)?,
-            None => self.closed_loop(&stop)?,
+        match (&self.report.report, &self.data) {
+            (Some(folder), _) => self.report(folder, &stop)?,
+            (None, Some(data)) => self.open_loop(data, &stop)?,
+            (None, None) => self.closed_loop(&stop)?,
         }
         Ok(ExitCode::SUCCESS)
     }
 
-    fn open_loop(&self, data: &Path, stop: &AtomicBool) -> Result<()> {
+    fn report(&self, folder: &Path, stop: &AtomicBool) -> Result<()> {
+        let device = super::parse_device(&self.device)?;
+        let mut checkpoints: Vec<(String, Checkpoint)> = Vec::new();
+        for (name, _, checkpoint) in self.models(&device)? {
+            let name = shown_path(&name);
+            let known = checkpoints.iter().any(|(other, _)| *other == name);
+            ensure!(!known, "--checkpoint: there are two models {name:?}; rename one of their folders");
+            checkpoints.push((name, checkpoint));
+        }
+        let inputs = Inputs {
+            arguments: &self.report,
+            checkpoints,
+            data: self.data.as_deref(),
+            masks: self.masks.as_deref(),
+            open_loop: self.open_loop_settings(self.films.unwrap_or(1))?,
+            closed_loop: self.loop_settings("", "none"),
+            disturb: &self.disturb,
+            device,
+            device_name: &self.device,
+            json: self.json.as_deref(),
+        };
+        inputs.run(folder, stop)
+    }
+
+    fn open_loop_settings(&self, films: usize) -> Result<OpenLoopSettings> {
         let latents = match self.latents {
             Some(LatentsName::Mode) => Latents::Mode,
             _ => Latents::Sample,
         };
-        let films = if self.out.is_some() { self.films } else { 0 };
-        let (context, imagined) = (self.context, self.imagined);
+        let (trajectories, context, imagined) = (self.trajectories, self.context, self.imagined);
         ensure!(context > 0 && imagined > 0, "--context and --imagined: expected at least 1");
-        ensure!(self.trajectories > 0, "--trajectories: expected at least 1");
-        let settings = OpenLoopSettings {
-            trajectories: self.trajectories,
-            context,
-            imagined,
-            latents,
-            seed: self.seed,
-            films,
-        };
+        ensure!(trajectories > 0, "--trajectories: expected at least 1");
+        Ok(OpenLoopSettings { trajectories, context, imagined, latents, seed: self.seed, films })
+    }
+
+    fn open_loop(&self, data: &Path, stop: &AtomicBool) -> Result<()> {
+        let films = if self.out.is_some() { self.films.unwrap_or(2) } else { 0 };
+        let settings = self.open_loop_settings(films)?;
         let device = super::parse_device(&self.device)?;
         let models = self.models(&device)?;
         let tasks = self.trajectories(data, &settings)?;
@@ -250,13 +282,14 @@ impl Evaluate {
             (None, None) => anyhow::bail!("give --checkpoint or --bundle"),
         };
         let mut reports = Vec::new();
-        for task in &self.tasks {
+        let all = self.tasks.iter().flat_map(|task| self.disturb.iter().map(move |disturb| (task, disturb)));
+        for (task, disturb) in all {
             let bar = episodes_bar(self.episodes, self.steps_max, task)?;
             let show = |positions: &[Position]| {
                 let steps = |at: &Position| at.episodes * u64::from(self.steps_max) + u64::from(at.steps);
                 bar.set_position(positions.iter().map(steps).sum());
             };
-            let report = closed_loop(&bundle, &self.loop_settings(task), stop, show);
+            let report = closed_loop(&bundle, &self.loop_settings(task, disturb), stop, show);
             bar.finish_and_clear();
             let report = report?;
             println!("{}", describe(&report));
@@ -267,13 +300,13 @@ impl Evaluate {
         self.json.as_deref().map_or(Ok(()), |file| super::write_json(file, &outcome))
     }
 
-    fn loop_settings(&self, task: &str) -> ClosedLoopSettings {
+    fn loop_settings(&self, task: &str, disturb: &str) -> ClosedLoopSettings {
         ClosedLoopSettings {
             task: task.to_owned(),
             episodes: self.episodes,
             seed: self.seed,
             steps_max: self.steps_max,
-            disturb: self.disturb.clone(),
+            disturb: disturb.to_owned(),
             engine: self.engine.clone(),
             sample: self.latents == Some(LatentsName::Sample),
             simulators: self.simulators,

@@ -11,6 +11,7 @@ mod online;
 mod parameters;
 mod parity;
 mod pretrain;
+mod report;
 mod train;
 
 use std::path::Path;
@@ -38,7 +39,7 @@ enum Verb {
     Parity(parity::Parity),
     Init(init::Init),
     Export(export::Export),
-    Evaluate(evaluate::Evaluate),
+    Evaluate(Box<evaluate::Evaluate>),
     Pretrain(pretrain::Pretrain),
     Fewshot(fewshot::Fewshot),
     Finetune(finetune::Finetune),

@@ -1,8 +1,10 @@
+use std::ops::Range;
 use std::path::{Path, PathBuf};
 use std::process::Command;
 use std::sync::atomic::{AtomicBool, AtomicU32, Ordering};
 use std::time::{Duration, Instant};
 
+use rcwm_models::episode::{Episode, EpisodeError};
 use rcwm_models::files::{FileError, read_capped};
 use rcwm_models::wire::{LinkError, LinkSettings, ObserverLink, Wait, forget_prefix};
 use serde::{Deserialize, Serialize};
@@ -64,13 +66,22 @@ pub enum ClosedLoopError {
         /// Episodes asked for.
         expected: u64,
     },
+    /// A recorded episode is unreadable.
+    #[error("recorded {0}")]
+    Episode(#[from] EpisodeError),
+    /// An episode was not recorded whole.
+    #[error("episode {number} was not recorded: observations of it were lost; run it again")]
+    Unrecorded {
+        /// Its number.
+        number: u64,
+    },
     /// It was stopped.
     #[error("interrupted; the simulators and runtimes were ended")]
     Interrupted,
 }
 
 /// What to run.
-#[derive(Debug, Clone, PartialEq, Serialize)]
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 pub struct ClosedLoopSettings {
     /// Name of the task.
     pub task: String,
@@ -95,7 +106,7 @@ pub struct ClosedLoopSettings {
 }
 
 /// How well a policy solves a task.
-#[derive(Debug, Clone, PartialEq, Serialize)]
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 pub struct ClosedLoopReport {
     /// What was run.
     pub settings: ClosedLoopSettings,
@@ -150,17 +161,51 @@ pub fn closed_loop(
     stop: &AtomicBool,
     mut seen: impl FnMut(&[Position]),
 ) -> Result<ClosedLoopReport, ClosedLoopError> {
+    let loops = settings.simulators.clamp(1, settings.episodes.max(1));
+    let share = |number: u64| settings.episodes * number / loops;
+    let shares: Vec<_> = (0..loops).map(|number| share(number)..share(number + 1)).collect();
+    run(bundle, settings, &shares, None, stop, &mut seen)
+}
+
+/// Runs one episode of those that [`closed_loop`] runs with the same settings, and records it. Without sampling it is the same one,
+/// step by step.
+///
+/// # Errors
+/// See [`ClosedLoopError`]; every process has ended then.
+pub fn recorded_episode(
+    bundle: &Path,
+    settings: &ClosedLoopSettings,
+    number: u64,
+    stop: &AtomicBool,
+) -> Result<Episode, ClosedLoopError> {
+    let folder = tempfile::tempdir().map_err(ClosedLoopError::Folder)?;
+    let settings = ClosedLoopSettings { episodes: 1, ..settings.clone() };
+    let share = number..number + 1;
+    run(bundle, &settings, std::slice::from_ref(&share), Some(folder.path()), stop, &mut |_| ())?;
+    let entries = std::fs::read_dir(folder.path()).map_err(ClosedLoopError::Folder)?;
+    let file =
+        entries.flatten().map(|entry| entry.path()).find(|path| path.extension() == Some("npz".as_ref()));
+    Ok(Episode::read(&file.ok_or(ClosedLoopError::Unrecorded { number })?)?)
+}
+
+/// Runs a simulator and a runtime for each share of the episodes.
+fn run(
+    bundle: &Path,
+    settings: &ClosedLoopSettings,
+    shares: &[Range<u64>],
+    record: Option<&Path>,
+    stop: &AtomicBool,
+    seen: &mut dyn FnMut(&[Position]),
+) -> Result<ClosedLoopReport, ClosedLoopError> {
     let begin = Instant::now();
     let programs = Programs::find(settings)?;
     let folder = tempfile::tempdir().map_err(ClosedLoopError::Folder)?;
     let domain = Domain::new();
-    let loops = settings.simulators.clamp(1, settings.episodes.max(1));
-    let share = |number: u64| settings.episodes * number / loops;
-    let start = |number: u64| {
-        let (first, last) = (share(number), share(number + 1));
-        Pair::start(&programs, bundle, settings, &domain, folder.path(), number, (first, last - first))
+    let place = Place { bundle, folder: folder.path(), record };
+    let start = |(number, share): (usize, &Range<u64>)| {
+        Pair::start(&programs, &place, settings, &domain, number, share)
     };
-    let mut pairs = (0..loops).map(start).collect::<Result<Vec<_>, _>>()?;
+    let mut pairs = shares.iter().enumerate().map(start).collect::<Result<Vec<_>, _>>()?;
     loop {
         if stop.load(Ordering::Relaxed) {
             return Err(ClosedLoopError::Interrupted);
@@ -176,7 +221,7 @@ pub fn closed_loop(
         std::thread::sleep(LOOK);
     }
     let served = pairs.iter().map(|pair| read_json(&pair.served)).collect::<Result<Vec<Served>, _>>()?;
-    let found = served.iter().map(|served| served.successful.len() as u64).sum();
+    let found: u64 = served.iter().map(|served| served.successful.len() as u64).sum();
     if found != settings.episodes {
         return Err(ClosedLoopError::Short { found, expected: settings.episodes });
     }
@@ -231,6 +276,15 @@ impl Programs {
     }
 }
 
+/// Folders that the programs are told.
+struct Place<'a> {
+    bundle: &'a Path,
+    /// For summaries.
+    folder: &'a Path,
+    /// For recorded episodes.
+    record: Option<&'a Path>,
+}
+
 /// A shared-memory domain of this evaluation's own: nothing else that runs on the machine can meet it.
 struct Domain {
     prefix: String,
@@ -272,15 +326,15 @@ struct Pair {
 impl Pair {
     fn start(
         programs: &Programs,
-        bundle: &Path,
+        place: &Place<'_>,
         settings: &ClosedLoopSettings,
         domain: &Domain,
-        folder: &Path,
-        number: u64,
-        (first_episode, episodes): (u64, u64),
+        number: usize,
+        share: &Range<u64>,
     ) -> Result<Self, ClosedLoopError> {
         let instance = format!("evaluate-{number}");
-        let file = |side: &str| folder.join(format!("{side}-{number}.json"));
+        let (first_episode, episodes) = (share.start, share.end - share.start);
+        let file = |side: &str| place.folder.join(format!("{side}-{number}.json"));
         let (served, ran) = (file("simulator"), file("runtime"));
         let observer = ObserverLink::open(domain.link(&instance))?;
         let mut command = Command::new(&programs.simulator);
@@ -301,9 +355,12 @@ impl Pair {
             .args(["--seed", &settings.seed.to_string()])
             .args(settings.sample.then_some("--sample"))
             .arg("--bundle")
-            .arg(bundle)
+            .arg(place.bundle)
             .arg("--json")
             .arg(&ran);
+        if let Some(record) = place.record {
+            command.arg("--record").arg(record);
+        }
         let runtime = RunningProgram::start(Program::RUNTIME, &instance, command)?;
         let position = Position::default();
         Ok(Self { observer, simulator, runtime, instance, first_episode, position, alone: None, served, ran })

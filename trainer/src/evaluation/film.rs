@@ -12,14 +12,14 @@ const STEP_CS: u16 = 10;
 const SIDE: u32 = IMAGE_SIDE as u32;
 /// Screen pixels per pixel of a picture.
 const SCALE: u32 = 2;
-const CELL: u32 = SIDE * SCALE;
+pub(super) const CELL: u32 = SIDE * SCALE;
 /// Between two pictures.
-const GAP: u32 = 4;
+pub(super) const GAP: u32 = 4;
 /// Thickness of the frame around imagined pictures.
 const FRAME: u32 = 2;
-const LETTERS: u32 = 13;
+pub(super) const LETTERS: u32 = 13;
 /// Of a row of words.
-const WORDS_HEIGHT: u32 = 20;
+pub(super) const WORDS_HEIGHT: u32 = 20;
 /// What the panels show; the last two are missing in a model with one branch.
 const TITLES: [&str; 7] =
     ["true", "imagined", "error", "robot", "robot mask", "environment", "environment mask"];
@@ -128,12 +128,18 @@ impl Film {
         self.steps.first().map_or(0, Vec::len)
     }
 
-    fn describe(&self, t: usize) -> String {
+    /// What the panel with this title shows at a step.
+    pub(super) fn panel(&self, t: usize, title: &str) -> Option<&[Colour]> {
+        let index = TITLES.iter().position(|known| *known == title)?;
+        Some(self.steps.get(t)?.get(index)?)
+    }
+
+    pub(super) fn describe(&self, t: usize) -> String {
         if t < self.context { format!("{t}: seen") } else { format!("{t}: imagined") }
     }
 
     /// Draws a picture enlarged, framed if it was imagined.
-    fn draw(&self, on: &mut RgbImage, (left, top): (u32, u32), picture: &[Colour], t: usize) {
+    pub(super) fn draw(&self, on: &mut RgbImage, (left, top): (u32, u32), picture: &[Colour], t: usize) {
         if t >= self.context {
             for y in 0..CELL + 2 * FRAME {
                 for x in 0..CELL + 2 * FRAME {

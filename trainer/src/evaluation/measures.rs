@@ -1,5 +1,6 @@
 use candle_core::{DType, Result, Tensor};
 use rcwm_models::{IMAGE_CHANNELS, IMAGE_SIDE};
+use serde::{Deserialize, Serialize};
 
 use crate::learning::Batch;
 use crate::model::agent::Agent;
@@ -10,7 +11,8 @@ const PIXELS: usize = IMAGE_SIDE * IMAGE_SIDE;
 const VALUES: usize = PIXELS * IMAGE_CHANNELS;
 
 /// What is measured of every step.
-#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+#[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord, Serialize, Deserialize)]
+#[serde(rename_all = "snake_case")]
 pub enum Measure {
     /// Squared error of the picture times the true robot mask, mean over the whole picture's 64 * 64 * 3 values: the robot dynamics
     /// error (paper, 5.2 and Fig. 4). Values of a picture lie in [0, 1].

@@ -14,7 +14,9 @@
 //! | `statistics` | bootstrap over episodes, Wilson's interval |
 //! | `closed_loop` | success rate of the exported policy, by simulators and runtimes |
 //! | `film` | what was imagined, as a strip and animated |
+//! | `attention` | what the environment asks of the robot while a step is imagined |
 
+mod attention;
 mod closed_loop;
 mod film;
 mod measures;
@@ -24,7 +26,10 @@ mod robot_dynamics;
 mod statistics;
 mod trajectories;
 
-pub use closed_loop::{ClosedLoopError, ClosedLoopReport, ClosedLoopSettings, Position, closed_loop};
+pub use attention::{Attention, AttentionFilm};
+pub use closed_loop::{
+    ClosedLoopError, ClosedLoopReport, ClosedLoopSettings, Position, closed_loop, recorded_episode,
+};
 pub use film::Film;
 pub use measures::{Measure, Trace, traces};
 pub use open_loop::{filtered, imagined, joined, open_loop};

@@ -3,7 +3,7 @@ use std::fmt::Write as _;
 
 use image::RgbImage;
 use rcwm_models::settings::ModelKind;
-use serde::Serialize;
+use serde::{Deserialize, Serialize};
 
 use super::statistics::{Bootstrap, Interval, mean_and_std};
 use super::{Measure, Measured, OpenLoopSettings, TaskTrajectories, Trace};
@@ -14,7 +14,7 @@ const PANEL: (u32, u32) = (460, 320);
 const COLUMNS: usize = 4;
 
 /// One measure over a task's trajectories.
-#[derive(Debug, Clone, PartialEq, Serialize)]
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 pub struct Series {
     /// Mean over all steps and trajectories.
     pub mean: Option<f64>,
@@ -29,7 +29,7 @@ pub struct Series {
 }
 
 /// A model on a task.
-#[derive(Debug, Clone, PartialEq, Serialize)]
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 pub struct TaskReport {
     /// The task.
     pub task: String,
@@ -38,9 +38,9 @@ pub struct TaskReport {
     /// Episodes they are of.
     pub episodes: usize,
     /// By measure, of imagined states.
-    pub imagined: BTreeMap<&'static str, Series>,
+    pub imagined: BTreeMap<Measure, Series>,
     /// By measure, of posterior states at the same steps.
-    pub posterior: BTreeMap<&'static str, Series>,
+    pub posterior: BTreeMap<Measure, Series>,
 }
 
 /// A model on every task.
@@ -81,7 +81,7 @@ pub struct OpenLoopReport {
     /// How.
     pub settings: OpenLoopSettings,
     /// What the numbers mean.
-    pub measures: BTreeMap<&'static str, &'static str>,
+    pub measures: BTreeMap<Measure, &'static str>,
     /// The models in the order they were given.
     pub models: Vec<ModelReport>,
     /// Every later model against the first.
@@ -109,21 +109,14 @@ fn drawn_mean(means: &[Option<f64>], draw: &[usize]) -> Option<f64> {
     mean_and_std(draw.iter().filter_map(|trajectory| means[*trajectory])).map(|(mean, _)| mean)
 }
 
-/// Draws of a task's trajectories; the same for every model.
-fn bootstrap(task: &TaskTrajectories, seed: u64) -> Bootstrap {
-    Bootstrap::new(&task.chosen.iter().map(|trajectory| trajectory.number).collect::<Vec<_>>(), seed)
-}
-
 impl TaskReport {
     /// Sums a task up.
     #[must_use]
     pub fn of(task: &TaskTrajectories, measured: &Measured, seed: u64) -> Self {
-        let bootstrap = bootstrap(task, seed);
+        // The same draws for every model.
+        let bootstrap = Bootstrap::new(&task.numbers(), seed);
         let all = |traces: &[Trace]| {
-            Measure::ALL
-                .iter()
-                .map(|measure| (measure.name(), Series::of(traces, *measure, &bootstrap)))
-                .collect()
+            Measure::ALL.iter().map(|measure| (*measure, Series::of(traces, *measure, &bootstrap))).collect()
         };
         Self {
             task: task.task.clone(),
@@ -131,6 +124,24 @@ impl TaskReport {
             episodes: task.episodes(),
             imagined: all(&measured.imagined),
             posterior: all(&measured.posterior),
+        }
+    }
+}
+
+impl TaskReport {
+    /// One measure of several models, by name, over the imagined steps of a task: a line a model, with a band of one standard
+    /// deviation over trajectories.
+    #[must_use]
+    pub fn panel(models: &[(&str, &Self)], measure: Measure) -> Panel {
+        let lines = models.iter().zip(COLOURS.iter().cycle());
+        Panel {
+            title: models.first().map_or_else(String::new, |(_, report)| report.task.clone()),
+            x_label: format!("imagined steps; {}", measure.title()),
+            scale: Scale::Linear,
+            lines: lines
+                .map(|((name, report), colour)| line(name, *colour, &report.imagined[&measure]))
+                .collect(),
+            marks: Vec::new(),
         }
     }
 }
@@ -145,19 +156,28 @@ impl Comparison {
         (against, other): (&str, &Measured),
         seed: u64,
     ) -> Option<Self> {
-        let means = |measured: &Measured| -> Vec<Option<f64>> {
-            measured.imagined.iter().map(|trace| trace.mean(Measure::RobotError)).collect()
-        };
-        let (ours, theirs) = (means(measured), means(other));
+        let (ours, theirs) = (measured.robot_errors(), other.robot_errors());
+        Self::of_means(&task.task, (model, &ours), (against, &theirs), &task.numbers(), seed)
+    }
+
+    /// The same of each trajectory's mean robot dynamics error; `episodes` says which episode each trajectory is of.
+    #[must_use]
+    pub fn of_means(
+        task: &str,
+        (model, ours): (&str, &[Option<f64>]),
+        (against, theirs): (&str, &[Option<f64>]),
+        episodes: &[usize],
+        seed: u64,
+    ) -> Option<Self> {
         let ratio = |draw: &[usize]| {
-            Some(drawn_mean(&ours, draw)? / drawn_mean(&theirs, draw)?).filter(|ratio| ratio.is_finite())
+            Some(drawn_mean(ours, draw)? / drawn_mean(theirs, draw)?).filter(|ratio| ratio.is_finite())
         };
         Some(Self {
-            task: task.task.clone(),
+            task: task.to_owned(),
             model: model.to_owned(),
             against: against.to_owned(),
             ratio: ratio(&(0..ours.len()).collect::<Vec<_>>())?,
-            interval: bootstrap(task, seed).interval(ratio),
+            interval: Bootstrap::new(episodes, seed).interval(ratio),
         })
     }
 }
@@ -166,7 +186,7 @@ impl OpenLoopReport {
     /// A report without models yet.
     #[must_use]
     pub fn new(settings: OpenLoopSettings) -> Self {
-        let measures = Measure::ALL.iter().map(|measure| (measure.name(), measure.definition())).collect();
+        let measures = Measure::ALL.into_iter().map(|measure| (measure, measure.definition())).collect();
         Self { settings, measures, models: Vec::new(), comparisons: Vec::new() }
     }
 
@@ -208,19 +228,9 @@ impl OpenLoopReport {
     /// Those of drawing.
     pub fn plot(&self, measure: Measure) -> Result<RgbImage, PlotError> {
         let tasks = self.models.first().map_or(0, |model| model.tasks.len());
-        let panel = |index: usize| Panel {
-            title: self.models[0].tasks[index].task.clone(),
-            x_label: format!("imagined steps; {}", measure.title()),
-            scale: Scale::Linear,
-            lines: self
-                .models
-                .iter()
-                .zip(COLOURS.iter().cycle())
-                .map(|(model, colour)| {
-                    line(&model.name, *colour, &model.tasks[index].imagined[measure.name()])
-                })
-                .collect(),
-            marks: Vec::new(),
+        let panel = |index: usize| {
+            let models = self.models.iter().map(|model| (model.name.as_str(), &model.tasks[index]));
+            TaskReport::panel(&models.collect::<Vec<_>>(), measure)
         };
         plots::draw(&(0..tasks).map(panel).collect::<Vec<_>>(), COLUMNS, PANEL)
     }
@@ -230,12 +240,11 @@ fn table_row(model: &str, name_width: usize, task: &TaskReport) -> String {
     let mean = |series: &Series, scale: f64, digits: usize| {
         series.mean.map_or_else(|| "-".to_owned(), |mean| format!("{:.digits$}", mean * scale))
     };
-    let imagined = |measure: Measure| &task.imagined[measure.name()];
+    let imagined = |measure: Measure| &task.imagined[&measure];
     let error = imagined(Measure::RobotError);
     let range =
         error.interval.map_or_else(String::new, |i| format!(" ({:.3} to {:.3})", i.low * 1e3, i.high * 1e3));
-    let overlap =
-        [imagined(Measure::MaskIou), &task.posterior[Measure::MaskIou.name()]].map(|x| mean(x, 1.0, 3));
+    let overlap = [imagined(Measure::MaskIou), &task.posterior[&Measure::MaskIou]].map(|x| mean(x, 1.0, 3));
     format!(
         "{:18} {model:name_width$} {:>27} {:>10} {:>15} {:>15} {:>10}",
         task.task,

@@ -4,7 +4,7 @@ use candle_core::Device;
 use serde::{Deserialize, Serialize};
 
 use super::open_loop::{filtered, imagined, joined};
-use super::{EvaluationError, Film, TaskTrajectories, Trace, traces};
+use super::{EvaluationError, Film, Measure, TaskTrajectories, Trace, traces};
 use crate::model::agent::Agent;
 use crate::model::latent::{Sampler, State};
 
@@ -19,6 +19,17 @@ pub enum Latents {
     Sample,
     /// The most probable class.
     Mode,
+}
+
+impl Latents {
+    /// Its name in files and on the command line.
+    #[must_use]
+    pub const fn name(self) -> &'static str {
+        match self {
+            Self::Sample => "sample",
+            Self::Mode => "mode",
+        }
+    }
 }
 
 /// How models are measured.
@@ -55,6 +66,14 @@ pub struct Measured {
     pub posterior: Vec<Trace>,
     /// Films of the first trajectories.
     pub films: Vec<Film>,
+}
+
+impl Measured {
+    /// Mean robot dynamics error of every imagined trajectory.
+    #[must_use]
+    pub fn robot_errors(&self) -> Vec<Option<f64>> {
+        self.imagined.iter().map(|trace| trace.mean(Measure::RobotError)).collect()
+    }
 }
 
 /// Measures a frozen agent on a task's trajectories; `seen` hears of every trajectory.

@@ -1,6 +1,6 @@
 use rand::{Rng, SeedableRng};
 use rand_chacha::ChaCha8Rng;
-use serde::Serialize;
+use serde::{Deserialize, Serialize};
 
 /// How many times a bootstrap draws anew.
 const RESAMPLES: usize = 1000;
@@ -10,7 +10,7 @@ const TAIL: f64 = 0.025;
 const Z: f64 = 1.959_963_985;
 
 /// An interval that holds the true value in 95 of 100 such experiments.
-#[derive(Debug, Clone, Copy, PartialEq, Serialize)]
+#[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
 pub struct Interval {
     /// Lower end.
     pub low: f64,

@@ -1,8 +1,8 @@
 use std::sync::Arc;
 
 use candle_core::Device;
-use rand::SeedableRng;
 use rand::seq::{SliceRandom, index};
+use rand::{Rng, SeedableRng};
 use rand_chacha::ChaCha8Rng;
 use rcwm_models::episode::Episode;
 
@@ -60,10 +60,33 @@ impl TaskTrajectories {
         replay.tasks().map(of).collect()
     }
 
+    /// One trajectory of at most `length` steps, from the first step of an episode with masks that the seed draws, of those that
+    /// succeeded where there are such: what comes before an object is touched is in it. None where no episode has two steps.
+    #[must_use]
+    pub fn whole(replay: &Replay, task: &str, length: usize, seed: u64) -> Option<Self> {
+        let replay = replay.masked();
+        let (_, episodes) = replay.tasks().find(|(name, _)| *name == task)?;
+        let longest = episodes.iter().map(|episode| episode.len()).max()?.min(length);
+        let fits = |episode: &Episode| longest > 1 && episode.len() >= longest;
+        let fitting = || episodes.iter().enumerate().filter(|(_, episode)| fits(episode));
+        let solved: Vec<_> = fitting().filter(|(_, episode)| episode.succeeded()).collect();
+        let from = if solved.is_empty() { fitting().collect() } else { solved };
+        let mut random = ChaCha8Rng::seed_from_u64(seed);
+        let (number, episode) = from.get(random.random_range(0..from.len().max(1)))?;
+        let trajectory = Trajectory { episode: Arc::clone(episode), number: *number, start: 0 };
+        Some(Self { task: task.to_owned(), length: longest, chosen: vec![trajectory] })
+    }
+
+    /// Which episode each is of.
+    #[must_use]
+    pub fn numbers(&self) -> Vec<usize> {
+        self.chosen.iter().map(|trajectory| trajectory.number).collect()
+    }
+
     /// Number of episodes they are of.
     #[must_use]
     pub fn episodes(&self) -> usize {
-        let mut numbers: Vec<usize> = self.chosen.iter().map(|trajectory| trajectory.number).collect();
+        let mut numbers = self.numbers();
         numbers.sort_unstable();
         numbers.dedup();
         numbers.len()
@@ -97,4 +120,27 @@ fn choose(episodes: &[&Arc<Episode>], count: usize, length: usize, seed: u64) ->
     // Neighbours are of different episodes: the first few, which films are made of, show more.
     chosen.shuffle(&mut random);
     chosen
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_whole_trajectory_begins_an_episode_that_was_solved() {
+        let mut replay = Replay::new(usize::MAX);
+        for (steps, solved) in [(30, false), (20, true), (30, true), (5, true)] {
+            let mut episode = Episode::blank(steps);
+            episode.robot_mask = Some(ndarray::Array3::from_elem((steps, 64, 64), false));
+            episode.success[steps - 1] = solved;
+            replay.add("hammer", episode).unwrap();
+        }
+        for seed in 0..10 {
+            let found = TaskTrajectories::whole(&replay, "hammer", 25, seed).unwrap();
+            assert_eq!((found.length, found.chosen[0].start, found.numbers()), (25, 0, vec![2]));
+        }
+        let longest = TaskTrajectories::whole(&replay, "hammer", 99, 0).unwrap();
+        assert_eq!(longest.length, 30, "as long as there are");
+        assert!(TaskTrajectories::whole(&replay, "reach", 25, 0).is_none());
+    }
 }

@@ -158,14 +158,27 @@ impl Rcwm {
     /// # Errors
     /// Those of candle.
     pub fn imagine_step(&self, state: &State, action: &Tensor, sampler: &mut Sampler) -> Result<State> {
+        self.attend_step(state, action, sampler).map(|(state, _)| state)
+    }
+
+    /// The same, with the attention map [B, n, n+k] of the interaction that led to it.
+    ///
+    /// # Errors
+    /// Those of candle.
+    pub fn attend_step(
+        &self,
+        state: &State,
+        action: &Tensor,
+        sampler: &mut Sampler,
+    ) -> Result<(State, Tensor)> {
         let [robot, environment] = &self.branches;
         let h = self.recur_robot(&state.branches[ROBOT], action)?;
         let robot = robot.draw(robot.prior_logits(&h)?, &h, sampler)?;
         let before = &state.branches[ENVIRONMENT];
-        let (e, _) = self.interaction.forward(&robot.z, &robot.h, &before.z)?;
+        let (e, attention) = self.interaction.forward(&robot.z, &robot.h, &before.z)?;
         let h = self.recur_environment(&e, &before.h)?;
         let environment = environment.draw(environment.prior_logits(&h)?, &h, sampler)?;
-        Ok(State { branches: vec![robot, environment] })
+        Ok((State { branches: vec![robot, environment] }, attention))
     }
 
     /// Both branches' pictures and their sum (eq. 8).

@@ -145,6 +145,29 @@ impl World {
         State::stack(&states, 1)
     }
 
+    /// [`World::imagine`], with the interaction's attention maps [B, L, n, n+k]; none in the vanilla baseline, which has no
+    /// interaction.
+    ///
+    /// # Errors
+    /// Those of candle.
+    pub fn imagine_attending(
+        &self,
+        start: &State,
+        actions: &Tensor,
+        sampler: &mut Sampler,
+    ) -> Result<Option<(State, Tensor)>> {
+        let Self::Rcwm(model) = self else { return Ok(None) };
+        let actions = sequence(actions)?; // [L, B, action]
+        let (mut states, mut maps): (Vec<State>, Vec<Tensor>) = (Vec::new(), Vec::new());
+        for t in 0..actions.dim(0)? {
+            let state = states.last().unwrap_or(start);
+            let (state, attention) = model.attend_step(state, &at_step(&actions, t)?, sampler)?;
+            states.push(state);
+            maps.push(attention);
+        }
+        Ok(Some((State::stack(&states, 1)?, Tensor::stack(&maps, 1)?)))
+    }
+
     /// Squared errors of a state's picture, [N], and of the robot's mask if the true one is given: [`ops::picture_loss`] of
     /// [`World::decode`], at a fraction of its cost. `images` are u8 [..., 64, 64, 3], `masks` [..., 64, 64] of 0 and 1.
     ///

@@ -58,8 +58,16 @@ pub const COLOURS: [Colour; 6] =
 /// # Errors
 /// [`PlotError::Picture`] or [`PlotError::File`].
 pub fn write_png(picture: &image::RgbImage, path: &std::path::Path) -> Result<(), PlotError> {
+    Ok(rcwm_models::files::write_atomic(path, &png(picture)?)?)
+}
+
+/// A picture as the bytes of a PNG file.
+///
+/// # Errors
+/// [`PlotError::Picture`].
+pub fn png(picture: &image::RgbImage) -> Result<Vec<u8>, PlotError> {
     let mut bytes = Vec::new();
     let encoder = PngEncoder::new_with_quality(&mut bytes, CompressionType::Best, FilterType::Adaptive);
     picture.write_with_encoder(encoder)?;
-    Ok(rcwm_models::files::write_atomic(path, &bytes)?)
+    Ok(bytes)
 }

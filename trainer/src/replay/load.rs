@@ -1,10 +1,12 @@
+use std::fmt::Write as _;
 use std::fs;
 use std::io;
 use std::path::{Path, PathBuf};
 
 use ndarray::Array3;
 use rcwm_models::IMAGE_SIDE;
-use rcwm_models::episode::{Episode, EpisodeError};
+use rcwm_models::episode::{EPISODE_BYTES_MAX, Episode, EpisodeError};
+use rcwm_models::files::{FileError, read_capped, sha256_hex};
 
 use super::{Replay, ReplayError};
 
@@ -25,6 +27,9 @@ pub enum LoadError {
         /// The folder.
         path: PathBuf,
     },
+    /// A file could not be read.
+    #[error("data: {0}")]
+    File(#[from] FileError),
     /// An episode's file is unusable.
     #[error("data: {0}")]
     Episode(#[from] EpisodeError),
@@ -91,6 +96,47 @@ impl Folder {
         Ok(Self { files, masks: masks.map(Path::to_path_buf) })
     }
 
+    /// The same episodes, task by task.
+    #[must_use]
+    pub fn by_task(&self) -> Vec<(String, Self)> {
+        let mut tasks: Vec<(String, Self)> = Vec::new();
+        for (task, file) in &self.files {
+            let entry = (task.clone(), file.clone());
+            match tasks.iter_mut().find(|(name, _)| name == task) {
+                Some((_, folder)) => folder.files.push(entry),
+                None => tasks.push((task.clone(), Self { files: vec![entry], masks: self.masks.clone() })),
+            }
+        }
+        tasks
+    }
+
+    /// One checksum of all episodes: of the names and contents of their files, and of their masks where these are pictures.
+    ///
+    /// # Errors
+    /// [`LoadError::Folder`] or [`LoadError::File`].
+    pub fn sha256(&self) -> Result<String, LoadError> {
+        let mut sums = String::new();
+        let mut add = |path: &Path| -> Result<(), LoadError> {
+            let bytes = read_capped(path, EPISODE_BYTES_MAX)?;
+            let _ = writeln!(sums, "{} {}", sha256_hex(&bytes), name_of(path));
+            Ok(())
+        };
+        for (task, path) in &self.files {
+            add(path)?;
+            let folder = self.masks.as_ref().map(|masks| masks_of(masks, task, path));
+            for picture in folder
+                .filter(|folder| folder.is_dir())
+                .map(|folder| sorted(&folder))
+                .transpose()?
+                .iter()
+                .flatten()
+            {
+                add(picture)?;
+            }
+        }
+        Ok(sha256_hex(sums.as_bytes()))
+    }
+
     /// Number of episodes.
     #[must_use]
     pub fn len(&self) -> usize {
@@ -120,7 +166,7 @@ impl Folder {
     fn read(&self, task: &str, path: &Path) -> Result<Episode, LoadError> {
         let mut episode = Episode::read(path)?;
         if let Some(masks) = &self.masks {
-            let folder = masks.join(task).join(path.file_stem().unwrap_or_default());
+            let folder = masks_of(masks, task, path);
             if folder.is_dir() {
                 episode.robot_mask = Some(read_masks(&folder, episode.len())?);
             }
@@ -157,6 +203,11 @@ impl Folder {
         }
         Ok(replay)
     }
+}
+
+/// Where the masks of an episode's file are, if they are pictures.
+fn masks_of(masks: &Path, task: &str, path: &Path) -> PathBuf {
+    masks.join(task).join(path.file_stem().unwrap_or_default())
 }
 
 fn sorted(folder: &Path) -> Result<Vec<PathBuf>, LoadError> {
@@ -249,5 +300,27 @@ mod tests {
     fn an_empty_folder_is_one_clear_error() {
         let folder = tempfile::tempdir().unwrap();
         assert!(matches!(Folder::list(folder.path(), None), Err(LoadError::NoEpisodes { .. })));
+    }
+
+    #[test]
+    fn a_checksum_is_of_one_task_and_changes_with_its_episodes() {
+        let folder = tempfile::tempdir().unwrap();
+        let write = |task: &str, name: &str| {
+            fs::create_dir_all(folder.path().join(task)).unwrap();
+            episode(3, 1.0).write(&folder.path().join(task).join(name)).unwrap();
+        };
+        let sums = || -> Vec<(String, String)> {
+            let tasks = Folder::list(folder.path(), None).unwrap().by_task();
+            tasks.into_iter().map(|(task, folder)| (task, folder.sha256().unwrap())).collect()
+        };
+        write("hammer", "a.npz");
+        write("reach", "a.npz");
+        let before = sums();
+        assert_eq!((before.len(), before[0].0.as_str()), (2, "hammer"));
+        assert_eq!(sums(), before);
+        write("reach", "b.npz");
+        let after = sums();
+        assert_eq!(after[0], before[0], "the other task is as it was");
+        assert_ne!(after[1].1, before[1].1);
     }
 }

@@ -1,0 +1,123 @@
+//! What models can do, as one page (spec, section 4).
+//!
+//! Nouns: a **part** is one thing that was measured, a policy on a task or a model on a task's trajectories. It is a JSON file in the
+//! report's folder `parts`, with its pictures beside it, and says what it was measured from, its **source**. A part whose source is
+//! what is asked for is not measured again. The **page** is drawn from the parts alone.
+//!
+//! | file | holds |
+//! | --- | --- |
+//! | `parts` | parts on disk |
+//! | `made` | when, with what and on which machine |
+//! | `success` | a policy in closed loop |
+//! | `dynamics` | a model on recorded trajectories, and its attention |
+//! | `results` | result files that were measured elsewhere |
+//! | `page` | the page and `report.json` |
+//! | `sections` | what stands on the page |
+//! | `html` | pictures, tables and intervals in HTML |
+
+mod dynamics;
+mod html;
+mod made;
+mod page;
+mod parts;
+mod results;
+mod sections;
+mod success;
+
+pub use dynamics::{AttentionPart, AttentionSource, Dynamics, DynamicsSource, Subject, UNDISTURBED};
+pub use made::{Made, shown_path, shown_words};
+pub use page::Report;
+pub use parts::{Draft, Measurement, Part, Store};
+pub use results::{ResultEntry, Results, ResultsSource};
+pub use success::{Policy, Success, SuccessFilm, SuccessSource, Tick, policies};
+
+use std::path::PathBuf;
+
+use rcwm_models::bundle::BundleError;
+use rcwm_models::files::FileError;
+
+use crate::checkpoint::CheckpointError;
+use crate::evaluation::{ClosedLoopError, EvaluationError};
+use crate::plots::PlotError;
+
+/// Why there is no report.
+#[derive(Debug, thiserror::Error)]
+pub enum ReportError {
+    /// A folder could not be made or listed.
+    #[error("report: {path}: {source}")]
+    Folder {
+        /// The folder.
+        path: PathBuf,
+        /// What the operating system said.
+        source: std::io::Error,
+    },
+    /// A file could not be read or written.
+    #[error("report: {0}")]
+    File(#[from] FileError),
+    /// A part is unreadable.
+    #[error("report: {path}: {reason}; remove the file and measure it again")]
+    Part {
+        /// The file.
+        path: PathBuf,
+        /// What is wrong.
+        reason: String,
+    },
+    /// A value cannot be written as JSON.
+    #[error("report: {0}")]
+    Json(#[source] serde_json::Error),
+    /// There are no bundles.
+    #[error(
+        "--bundles {path} holds no bundle of a task: expected folders with a manifest.toml, named after their tasks (hammer, ...)"
+    )]
+    NoBundles {
+        /// The folder.
+        path: PathBuf,
+    },
+    /// Two bundles would be one row.
+    #[error("--bundles: there are two policies {name:?} for {task}; rename one of their folders")]
+    SamePolicy {
+        /// The policy's name.
+        name: String,
+        /// Its task.
+        task: String,
+    },
+    /// A result file is none.
+    #[error("--results {path}: {reason}; expected what `evaluate --task ... --json` writes")]
+    Results {
+        /// The file.
+        path: PathBuf,
+        /// What is wrong.
+        reason: String,
+    },
+    /// A bundle was refused.
+    #[error("{path}: {source}")]
+    Bundle {
+        /// Its folder.
+        path: PathBuf,
+        /// Why.
+        source: Box<BundleError>,
+    },
+    /// A checkpoint was refused.
+    #[error(transparent)]
+    Checkpoint(#[from] CheckpointError),
+    /// A policy could not be run.
+    #[error(transparent)]
+    ClosedLoop(#[from] ClosedLoopError),
+    /// A model could not be measured.
+    #[error(transparent)]
+    Evaluation(#[from] EvaluationError),
+    /// A picture could not be drawn.
+    #[error(transparent)]
+    Plot(#[from] PlotError),
+}
+
+impl ReportError {
+    /// Whether Ctrl-C is why.
+    #[must_use]
+    pub const fn is_interrupted(&self) -> bool {
+        matches!(
+            self,
+            Self::ClosedLoop(ClosedLoopError::Interrupted) | Self::Evaluation(EvaluationError::Interrupted)
+        )
+    }
+}
