@@ -81,7 +81,8 @@ fn painted(
     if every == 1 {
         return agent.world.picture_loss(posteriors, &batch.image, batch.robot_mask.as_ref());
     }
-    let steps: Vec<u32> = (0..length).filter(|t| (t + batch.number) % every == 0).map(|t| t as u32).collect();
+    let steps: Vec<u32> =
+        (0..length).filter(|t| (t + batch.number).is_multiple_of(every)).map(|t| t as u32).collect();
     let count = steps.len();
     let steps = Tensor::from_vec(steps, count, batch.image.device())?;
     let chosen = |x: &Tensor| x.contiguous()?.index_select(&steps, 1);

@@ -177,14 +177,14 @@ impl Plan {
 mod tests {
     use super::*;
 
-    const AMOUNTS: Amounts = Amounts { expert: 5, mixed: 3, random: 1, masked: 4 };
+    const AMOUNTS: Amounts = Amounts { expert: 5, mixed: 3, random: 1, pushed: 0, masked: 4 };
 
     #[test]
     fn masks_are_spread_over_the_scripts() {
         let shares = [Script::Mixed, Script::Random, Script::Expert].map(|script| AMOUNTS.masked_of(script));
         assert_eq!(shares, [2, 1, 1]);
         let all = Amounts { masked: 99, ..AMOUNTS };
-        assert_eq!(Script::ALL.map(|script| all.masked_of(script)), [5, 3, 1]);
+        assert_eq!(Script::ALL.map(|script| all.masked_of(script)), [5, 3, 1, 0]);
     }
 
     #[test]

@@ -230,11 +230,12 @@ impl Fewshot {
     ) -> Result<(), TrainingError> {
         work.stage = Some(stage);
         let fewshot = &self.settings.fewshot;
-        let imitation = (stage != Stage::Actor && fewshot.imitation_scale > 0.0).then(|| Imitation {
+        let imitation = Imitation {
             scale: fewshot.imitation_scale,
             loss: fewshot.cloning.loss,
             learning_rate: self.settings.world.adam.learning_rate,
-        });
+        };
+        let imitation = (stage != Stage::Actor && imitation.scale > 0.0).then_some(imitation);
         self.world.train(stage.trained(self.settings.model.kind, imitation.is_some()), imitation)?;
         let seed = self.settings.seed;
         if stage != Stage::Actor || fewshot.world_goes_on {
