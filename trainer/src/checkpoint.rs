@@ -110,6 +110,9 @@ pub struct CheckpointSettings {
     pub updates: u64,
     /// What it was trained on, in words.
     pub data: String,
+    /// Processor time of the run that it took, of all threads, in seconds; 0 where it is not known.
+    #[serde(default)]
+    pub cpu_seconds: f64,
     /// sha256 of the weights' file, lower-case hexadecimal; empty only before it is written.
     pub weights_sha256: String,
     /// The sizes.

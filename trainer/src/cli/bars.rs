@@ -6,7 +6,7 @@ use anyhow::{Context, Result};
 use indicatif::{ProgressBar, ProgressStyle};
 use rcwm_models::settings::Preset;
 use rcwm_trainer::checkpoint::Checkpoint;
-use rcwm_trainer::training::TrainingSettings;
+use rcwm_trainer::training::{Phase, TrainingSettings};
 
 use super::PresetName;
 
@@ -26,8 +26,8 @@ pub fn absolute(path: &Path) -> Result<PathBuf> {
     std::path::absolute(path).with_context(|| format!("{}", path.display()))
 }
 
-/// Settings for a model of the checkpoint's sizes, with the amounts of `preset`, else those of the checkpoint's own.
-pub fn settings_from(source: &Checkpoint, preset: Option<PresetName>) -> TrainingSettings {
+/// Settings of a phase for a model of the checkpoint's sizes, with the amounts of `preset`, else those of the checkpoint's own.
+pub fn settings_from(source: &Checkpoint, phase: Phase, preset: Option<PresetName>) -> TrainingSettings {
     let own = match source.settings.preset.as_str() {
         "debug" => Preset::Debug,
         "paper" => Preset::Paper,
@@ -35,7 +35,7 @@ pub fn settings_from(source: &Checkpoint, preset: Option<PresetName>) -> Trainin
     };
     let model = &source.settings.model;
     let preset = preset.map_or(own, PresetName::preset);
-    let mut settings = TrainingSettings::preset(preset, model.kind, PathBuf::new());
+    let mut settings = TrainingSettings::of_phase(phase, preset, model.kind);
     settings.model = model.clone();
     settings.preset.clone_from(&source.settings.preset);
     settings

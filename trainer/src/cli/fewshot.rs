@@ -102,8 +102,7 @@ impl Fewshot {
         let mut settings = match source {
             None => Run::settings(&self.out)?,
             Some(source) => {
-                let mut settings = bars::settings_from(source, self.preset);
-                settings.phase = Phase::Fewshot;
+                let mut settings = bars::settings_from(source, Phase::Fewshot, self.preset);
                 settings.from = absolute(self.from.as_deref().unwrap_or(&self.out))?;
                 settings.reset.parts = self.reset;
                 settings

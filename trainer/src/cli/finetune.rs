@@ -53,8 +53,7 @@ impl Finetune {
         let source = self.online.source(self.from.as_deref())?;
         self.online.run(source.as_ref(), || {
             let source = source.as_ref().ok_or_else(|| anyhow::anyhow!("--from is missing"))?;
-            let mut settings = bars::settings_from(source, self.preset);
-            settings.phase = Phase::Finetune;
+            let mut settings = bars::settings_from(source, Phase::Finetune, self.preset);
             settings.from = absolute(self.from.as_deref().unwrap_or(&self.online.out))?;
             settings.reset.parts = self.reset;
             settings.reset.keep_behaviour = self.keep_behaviour;

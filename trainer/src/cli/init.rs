@@ -38,6 +38,7 @@ impl Init {
             seed: self.seed,
             updates: 0,
             data: "none: untrained".into(),
+            cpu_seconds: 0.0,
             weights_sha256: String::new(),
             model,
         };

@@ -1,6 +1,7 @@
 //! The command line, one file per verb.
 
 mod bars;
+mod card;
 mod collect;
 mod evaluate;
 mod export;
@@ -40,6 +41,7 @@ enum Verb {
     Init(init::Init),
     Export(export::Export),
     Evaluate(Box<evaluate::Evaluate>),
+    Card(card::Card),
     Pretrain(pretrain::Pretrain),
     Fewshot(fewshot::Fewshot),
     Finetune(finetune::Finetune),
@@ -56,6 +58,7 @@ impl Arguments {
             Verb::Init(verb) => verb.run(),
             Verb::Export(verb) => verb.run(),
             Verb::Evaluate(verb) => verb.run(),
+            Verb::Card(verb) => verb.run(),
             Verb::Pretrain(verb) => verb.run(),
             Verb::Fewshot(verb) => verb.run(),
             Verb::Finetune(verb) => verb.run(),

@@ -104,12 +104,15 @@ impl FewshotSettings {
                 ..paper
             },
             Preset::Small => Self {
-                environment_updates: 300,
-                world_updates: 300,
-                actor_updates: 16_000,
+                steps_after_success: 30,
+                environment_updates: 100,
+                world_updates: 1000,
+                actor_updates: 4000,
+                imitation_scale: 100.0,
+                starts: Starts::Episodes,
                 cloning: CloningSettings {
                     imagination_rows: 64,
-                    weight: Ramp { updates: 16_000, ..paper.cloning.weight },
+                    weight: Ramp { updates: 4000, ..paper.cloning.weight },
                     imagination_weight: off,
                     ..paper.cloning
                 },

@@ -5,6 +5,7 @@ use std::path::{Path, PathBuf};
 use candle_core::Device;
 use rcwm_models::files::{read_capped, write_atomic};
 use rcwm_models::tensors::Tensors;
+use rustix::time::{ClockId, clock_gettime};
 use serde::{Deserialize, Serialize};
 
 use super::metrics::scalars;
@@ -26,6 +27,37 @@ pub struct Run {
     folder: PathBuf,
     metrics: File,
     events: EventFile,
+    cpu: CpuTime,
+}
+
+/// Processor time of all threads that a run has taken.
+#[derive(Debug, Clone, Copy)]
+struct CpuTime {
+    /// By earlier processes, in seconds.
+    earlier: f64,
+    /// This process's when it took up the run.
+    begin: f64,
+}
+
+impl CpuTime {
+    fn since_now(earlier: f64) -> Self {
+        Self { earlier, begin: Self::of_process() }
+    }
+
+    fn of_process() -> f64 {
+        let time = clock_gettime(ClockId::ProcessCPUTime);
+        time.tv_sec as f64 + 1e-9 * time.tv_nsec as f64
+    }
+
+    fn seconds(self) -> f64 {
+        self.earlier + Self::of_process() - self.begin
+    }
+}
+
+/// Which episodes, without the place where they lie on this machine.
+fn describe_data(settings: &TrainingSettings) -> String {
+    let folder = settings.data.file_name().unwrap_or(settings.data.as_os_str()).to_string_lossy();
+    if settings.task.is_empty() { folder.into_owned() } else { format!("{folder}, {}", settings.task) }
 }
 
 /// Where a run goes on.
@@ -97,7 +129,8 @@ impl Run {
         if stored.model != settings.model {
             return Err(TrainingError::OtherModel);
         }
-        let run = Self::resume(folder, settings, state.updates)?;
+        let mut run = Self::resume(folder, settings, state.updates)?;
+        run.cpu.earlier = stored.cpu_seconds;
         Ok(GoesOn::From { run, parameters, state, moments })
     }
 
@@ -133,7 +166,7 @@ impl Run {
         let path = folder.join(METRICS_FILE);
         let metrics = OpenOptions::new().append(true).open(&path).map_err(failed(&path))?;
         let events = EventFile::begin(folder, first_update).map_err(failed(folder))?;
-        Ok(Self { folder: folder.to_path_buf(), metrics, events })
+        Ok(Self { folder: folder.to_path_buf(), metrics, events, cpu: CpuTime::since_now(0.0) })
     }
 
     /// The settings of the run in `folder`.
@@ -209,7 +242,8 @@ impl Run {
                 preset: settings.preset.clone(),
                 seed: settings.seed,
                 updates: state.updates,
-                data: settings.data.display().to_string(),
+                data: describe_data(settings),
+                cpu_seconds: self.cpu.seconds(),
                 weights_sha256: String::new(),
                 model: settings.model.clone(),
             },

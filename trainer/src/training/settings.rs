@@ -172,6 +172,19 @@ impl TrainingSettings {
         }
     }
 
+    /// A run of another phase, with what the preset has for it: few-shot learning of `small` goes through whole demonstrations, paints few
+    /// of their steps, and lets the reward say what matters in the scene (tried in `LAB.md`).
+    #[must_use]
+    pub fn of_phase(phase: Phase, preset: Preset, kind: ModelKind) -> Self {
+        let mut settings = Self { phase, ..Self::preset(preset, kind, PathBuf::new()) };
+        if (phase, preset) == (Phase::Fewshot, Preset::Small) {
+            settings.replay = ReplaySettings { batch: 4, length: 64, ..settings.replay };
+            settings.world.paint_every = 4;
+            settings.world.reward_scale = 10.0;
+        }
+        settings
+    }
+
     /// Checks what TOML's types do not.
     ///
     /// # Errors

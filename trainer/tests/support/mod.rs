@@ -40,6 +40,7 @@ fn settings(model: ModelSettings) -> CheckpointSettings {
         seed: 0,
         updates: 0,
         data: "a test".into(),
+        cpu_seconds: 0.0,
         weights_sha256: String::new(),
         model,
     }
