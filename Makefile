@@ -2,9 +2,10 @@
 SHELL := /bin/bash
 export PYO3_PYTHON := $(CURDIR)/.venv/bin/python
 CARGO ?= cargo
-BUNDLE ?= models/bundles/untrained
-TASK ?= button-press
+TASK ?= coffee-pull
+BUNDLE ?= models/bundles/$(TASK)
 EPISODES ?= 2
+SEED ?= 1
 OUT ?= runs/demo
 PRETRAINED ?= models/small
 DEMONSTRATIONS ?= 50
@@ -16,10 +17,10 @@ BIN = $${CARGO_TARGET_DIR:-target}/release
 help: ## What there is
 	@grep -hE '^[a-z-]+:.*##' $(MAKEFILE_LIST) | sed -E 's/:.*## /\t/' | expand -t 10
 
-demo: ## Simulator and controller over shared memory: summary and a film in runs/demo
+demo: ## A trained policy (TASK=coffee-pull) over shared memory: summary and films in runs/demo
 	@scripts/setup demo
 	$(CARGO) build --release --locked -p rcwm-simulator -p rcwm-runtime
-	@scripts/demo "$(BUNDLE)" "$(TASK)" "$(EPISODES)" "$(OUT)"
+	@scripts/demo "$(BUNDLE)" "$(TASK)" "$(EPISODES)" "$(OUT)" "$(SEED)"
 
 learn: ## A new task (TASK=coffee-pull) from 50 demonstrations, deployed and scored: policy, film and figures in runs/learn/TASK
 	@scripts/setup demo

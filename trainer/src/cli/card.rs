@@ -108,7 +108,7 @@ impl Card {
         for scored in &results.tasks {
             card += &scored.row();
         }
-        let fewshot = &settings.fewshot;
+        let (fewshot, kind) = (&settings.fewshot, format!("{:?}", model.kind).to_lowercase());
         card += &format!(
             "| demonstrations | {}, of the scripted expert |\n| updates | {} of the environment's side, {} of the whole world model, both with \
              the actor; {} of the actor alone |\n| processor time | {:.0} minutes, of all cores together |\n",
@@ -119,8 +119,8 @@ impl Card {
             learnt.cpu_seconds / 60.0
         );
         card += &format!(
-            "| model | {:?}, depth {}, {} x {} latents, width {} |\n",
-            model.kind, model.cnn_depth, model.categoricals, model.classes, model.deter
+            "| model | {}, depth {}, {} x {} latents, width {} |\n",
+            kind, model.cnn_depth, model.categoricals, model.classes, model.deter
         );
         if let Some(pretrained) = pretrained {
             card += &format!(

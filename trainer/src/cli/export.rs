@@ -1,5 +1,5 @@
 use std::io::IsTerminal;
-use std::path::PathBuf;
+use std::path::{Path, PathBuf};
 use std::process::ExitCode;
 use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, Ordering};
@@ -97,6 +97,10 @@ impl Export {
         let mut checkpoint = Checkpoint::read(&self.checkpoint, &Device::Cpu)?;
         if self.half {
             checkpoint = checkpoint.rounded()?;
+        }
+        // What is shipped says which episodes it learnt from, not where they lie on this machine.
+        if let Some(folder) = Path::new(&checkpoint.settings.data).file_name() {
+            checkpoint.settings.data = folder.to_string_lossy().into_owned();
         }
         if self.form == Form::Checkpoint {
             return self.checkpoint(&checkpoint);

@@ -25,8 +25,16 @@ struct Row {
     phase: String,
     losses: Option<Losses>,
     held_out: Option<Losses>,
+    cloning: Option<Cloning>,
     gradient_norm: Option<f64>,
     updates_per_second: Option<f64>,
+}
+
+/// The actor's own updates.
+#[derive(Debug, Default, Deserialize)]
+#[serde(default)]
+struct Cloning {
+    loss: Option<f64>,
 }
 
 #[derive(Debug, Default, Deserialize)]
@@ -38,14 +46,19 @@ struct Losses {
     reward: Option<f64>,
     robot_kl: Option<f64>,
     environment_kl: Option<f64>,
+    cloning: Option<f64>,
 }
 
 type OfLosses = fn(&Losses) -> Option<f64>;
 
-const LOSSES: [(&str, OfLosses); 6] = [
+const MASK: &str = "robot mask, squared error summed";
+const CLONING: &str = "cloning, squared error summed";
+
+const LOSSES: [(&str, OfLosses); 7] = [
     ("total loss", |losses| losses.total),
     ("image, squared error summed over pixels", |losses| losses.image),
-    ("robot mask, squared error summed", |losses| losses.robot_mask),
+    (MASK, |losses| losses.robot_mask),
+    (CLONING, |losses| losses.cloning),
     ("reward, cross-entropy (nats)", |losses| losses.reward),
     ("KL robot (nats)", |losses| losses.robot_kl),
     ("KL environment (nats)", |losses| losses.environment_kl),
@@ -77,10 +90,16 @@ fn panels(rows: &[Row], warm_up_updates: u64) -> Vec<Panel> {
         lines,
         marks: marks(),
     };
+    // A run has masks or demonstrations: the panel of the other would be empty.
+    let clones = rows.iter().any(|row| clones(row).is_some());
     let mut panels: Vec<Panel> = LOSSES
         .iter()
+        .filter(|(title, _)| *title != if clones { MASK } else { CLONING })
         .map(|(title, of)| {
-            let trained = points(rows, |row| row.losses.as_ref().and_then(of));
+            let trained = match *title {
+                CLONING => points(rows, clones),
+                _ => points(rows, |row| row.losses.as_ref().and_then(of)),
+            };
             let held_out = points(rows, |row| row.held_out.as_ref().and_then(of));
             let mut lines = smoothed("trained on", COLOURS[0], trained, warm_up_updates);
             if !held_out.is_empty() {
@@ -96,6 +115,12 @@ fn panels(rows: &[Row], warm_up_updates: u64) -> Vec<Panel> {
         panels.push(panel(title, scale, smoothed("", COLOURS[0], points(rows, of), warm_up_updates)));
     }
     panels
+}
+
+/// The cloning loss of an update, of whichever stage.
+fn clones(row: &Row) -> Option<f64> {
+    let own = row.cloning.as_ref().and_then(|cloning| cloning.loss);
+    own.or_else(|| row.losses.as_ref().and_then(|losses| losses.cloning))
 }
 
 fn points(rows: &[Row], of: impl Fn(&Row) -> Option<f64>) -> Vec<(f64, f64)> {

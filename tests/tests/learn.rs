@@ -1,0 +1,54 @@
+//! `make learn` in small: a task from demonstrations to a deployed, scored policy with its card, and again from where it was.
+#![allow(clippy::unwrap_used, reason = "a test may panic")]
+
+use std::path::Path;
+use std::process::Command;
+
+use rcwm_models::episode::Episode;
+use rcwm_tests::{Domain, Running, binary, read_json, root};
+
+/// The script as `make learn` calls it: two demonstrations, one episode to be scored by.
+fn learn(domain: &Domain, pretrained: &Path, out: &Path) -> Command {
+    let mut command = Command::new(root().join("scripts/learn"));
+    let target = binary("rcwm-trainer").ancestors().nth(2).unwrap().to_path_buf();
+    command.arg("button-press").arg(pretrained).arg(out).args(["2", "1"]);
+    command.env("CARGO_TARGET_DIR", target).env("RCWM_PREFIX", domain.prefix());
+    command.stdin(std::process::Stdio::null());
+    command
+}
+
+#[test]
+fn a_task_is_learnt_deployed_and_scored_in_one_go() {
+    let folder = tempfile::tempdir().unwrap();
+    let (pretrained, out) = (folder.path().join("pretrained"), folder.path().join("out"));
+    let domain = Domain::new();
+    let mut init = domain.command("rcwm-trainer");
+    init.args(["init", "--preset", "debug", "--out"]).arg(&pretrained);
+    Running::start(init).succeed();
+
+    Running::start(learn(&domain, &pretrained, &out)).succeed();
+    let demonstrations = out.join("demonstrations/button-press");
+    let mut pushed = 0;
+    for entry in std::fs::read_dir(&demonstrations).unwrap() {
+        let episode = Episode::read(&entry.unwrap().path()).unwrap();
+        assert!(episode.len() > 100 && !episode.pushed[0]);
+        pushed += episode.pushed.iter().filter(|pushed| **pushed).count();
+    }
+    assert!(pushed > 0, "nobody was pushed off course");
+    let success = read_json(&out.join("success.json"));
+    assert_eq!(success["tasks"][0]["episodes"], 1, "{success}");
+    let card = std::fs::read_to_string(out.join("bundle/README.md")).unwrap();
+    for part in ["# button-press", "| success, button-press |", "2, of the scripted expert", "film.gif"] {
+        assert!(card.contains(part), "{part:?} is not in {card}");
+    }
+    assert!(!card.contains(folder.path().to_str().unwrap()), "a path of this machine: {card}");
+    assert!(std::fs::metadata(out.join("bundle/film.gif")).unwrap().len() > 1000);
+
+    // The same again finds demonstrations and policy, and ends with the same numbers.
+    let mut again = Running::start(learn(&domain, &pretrained, &out));
+    again.succeed();
+    assert!(again.printed().contains("0 episodes, 0 steps"), "{}", again.printed());
+    let repeated = read_json(&out.join("success.json"));
+    assert_eq!(repeated["tasks"][0]["returns"], success["tasks"][0]["returns"]);
+    assert_eq!(domain.leftovers(), Vec::<String>::new());
+}
