@@ -2,7 +2,7 @@
 SHELL := /bin/bash
 export PYO3_PYTHON := $(CURDIR)/.venv/bin/python
 CARGO ?= cargo
-TASK ?= coffee-pull
+TASK ?= hammer
 BUNDLE ?= models/bundles/$(TASK)
 EPISODES ?= 2
 SEED ?= 1
@@ -17,7 +17,7 @@ BIN = $${CARGO_TARGET_DIR:-target}/release
 help: ## What there is
 	@grep -hE '^[a-z-]+:.*##' $(MAKEFILE_LIST) | sed -E 's/:.*## /\t/' | expand -t 10
 
-demo: ## A trained policy (TASK=coffee-pull) over shared memory: summary and films in runs/demo
+demo: ## A trained policy (TASK=hammer) over shared memory: summary and films in runs/demo
 	@scripts/setup demo
 	$(CARGO) build --release --locked -p rcwm-simulator -p rcwm-runtime
 	@scripts/demo "$(BUNDLE)" "$(TASK)" "$(EPISODES)" "$(OUT)" "$(SEED)"

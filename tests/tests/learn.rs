@@ -52,3 +52,26 @@ fn a_task_is_learnt_deployed_and_scored_in_one_go() {
     assert_eq!(repeated["tasks"][0]["returns"], success["tasks"][0]["returns"]);
     assert_eq!(domain.leftovers(), Vec::<String>::new());
 }
+
+#[test]
+fn every_policy_that_ships_is_verified_and_has_a_card_and_a_film() {
+    let mut policies = 0;
+    for entry in std::fs::read_dir(root().join("models/bundles")).unwrap() {
+        let bundle = entry.unwrap().path();
+        if !bundle.is_dir() {
+            continue;
+        }
+        let mut verify = Command::new(binary("rcwm-runtime"));
+        verify.arg("verify").arg("--bundle").arg(&bundle);
+        Running::start(verify).succeed();
+        if !bundle.ends_with("untrained") {
+            let card = std::fs::read_to_string(bundle.join("README.md")).unwrap();
+            assert!(card.contains("of 50; 95%") && bundle.join("film.gif").is_file(), "{}", bundle.display());
+            policies += 1;
+        }
+    }
+    assert!(policies > 0);
+    let mut verify = Command::new(binary("rcwm-runtime"));
+    verify.arg("verify").arg("--bundle").arg(root().join("models/small/bundle"));
+    Running::start(verify).succeed();
+}

@@ -19,7 +19,7 @@ pub(super) struct VerifyArguments {
     /// Engine; `all` leaves out ONNX Runtime where it is not installed, and says so
     #[arg(long, value_enum, default_value = "all")]
     engine: EngineChoice,
-    /// Largest absolute error of a part's output
+    /// Largest error of a part's output, as a share of its largest value where that is above 1
     #[arg(long, value_name = "ERROR", default_value = "1e-5")]
     tolerance: f32,
     /// Also measures what 16-bit weights (run --half-weights) change

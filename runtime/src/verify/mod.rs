@@ -1,7 +1,7 @@
 //! A bundle against its golden values.
 //!
-//! **Parts.** Every part alone, on the inputs the trainer had (teacher forcing): largest absolute error of each output; classes
-//! must be the same.
+//! **Parts.** Every part alone, on the inputs the trainer had (teacher forcing): largest absolute error of each output, against its
+//! largest value where that is above 1; classes must be the same.
 //!
 //! **Tick.** The whole tick, over all golden ticks, carrying its own state. Classes must be the same and actions within
 //! [`ACTION_TOLERANCE`]. A class may flip where the trainer's own two best were nearly equal: every flip is listed with its margin,
@@ -58,6 +58,9 @@ pub struct OutputError {
     pub ticks: usize,
     /// Largest absolute error; for classes the number of those that differ.
     pub error_max: f32,
+    /// The golden value that is farthest from 0, or 1 if that is more: what an error is small or large against. A trained model's logits
+    /// are large, and 32 bits round them accordingly. Only of values, not of classes.
+    pub scale: f32,
     /// Whether it counts classes.
     pub classes: bool,
 }
@@ -174,10 +177,11 @@ fn failures(parts: &[PartReport], recurrent: &RecurrentReport, tolerance: f32) -
     let mut failures = Vec::new();
     for part in parts {
         for output in part.outputs.iter().filter(|output| !output.classes) {
-            if exceeds(output.error_max, tolerance) {
+            let accepted = tolerance * output.scale;
+            if exceeds(output.error_max, accepted) {
                 let OutputError { output, error_max, .. } = output;
                 failures.push(format!(
-                    "{}: {output} is {error_max:.2e} off, accepted is {tolerance:.0e}",
+                    "{}: {output} is {error_max:.2e} off, accepted is {accepted:.1e}",
                     part.part
                 ));
             }
@@ -242,7 +246,7 @@ impl EngineReport {
 
 impl OutputError {
     fn text(&self) -> String {
-        let Self { output, error_max, ticks, classes } = self;
+        let Self { output, error_max, ticks, classes, .. } = self;
         if *classes {
             format!("{output} {error_max:.0} differ/{ticks}")
         } else {

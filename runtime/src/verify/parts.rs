@@ -133,7 +133,7 @@ impl Place {
     fn new(covered: usize, spec: TensorSpec) -> Self {
         let len = spec.shape.iter().product();
         let classes = spec.dtype == DType::I64;
-        let error = OutputError { output: spec.name.clone(), ticks: 0, error_max: 0.0, classes };
+        let error = OutputError { output: spec.name.clone(), ticks: 0, error_max: 0.0, scale: 1.0, classes };
         let (f32, i64) = if classes { (Vec::new(), vec![0; len]) } else { (vec![0.0; len], Vec::new()) };
         Self { spec, covered, f32, i64, error }
     }
@@ -156,6 +156,10 @@ impl Place {
         if !self.error.classes {
             let expected = golden.expect_f32(part, &self.spec.name, tick)?;
             self.error.error_max = worst(self.error.error_max, error_max(&self.f32, expected));
+            self.error.scale = expected
+                .iter()
+                .filter(|x| x.is_finite())
+                .fold(self.error.scale, |scale, x| scale.max(x.abs()));
             return Ok(());
         }
         let index = usize::from(self.spec.name == "posterior_z");

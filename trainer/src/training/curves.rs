@@ -91,10 +91,10 @@ fn panels(rows: &[Row], warm_up_updates: u64) -> Vec<Panel> {
         marks: marks(),
     };
     // A run has masks or demonstrations: the panel of the other would be empty.
-    let clones = rows.iter().any(|row| clones(row).is_some());
+    let demonstrated = rows.iter().any(|row| clones(row).is_some());
     let mut panels: Vec<Panel> = LOSSES
         .iter()
-        .filter(|(title, _)| *title != if clones { MASK } else { CLONING })
+        .filter(|(title, _)| *title != if demonstrated { MASK } else { CLONING })
         .map(|(title, of)| {
             let trained = match *title {
                 CLONING => points(rows, clones),
