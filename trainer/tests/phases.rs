@@ -298,7 +298,7 @@ fn the_action_of_a_state_is_the_one_that_led_to_the_next_image() {
         rows: 2,
         length: 3,
         image: vec![0; 6 * IMAGE_BYTES],
-        action: (0..24).map(|x| 0.01 * (x / 4) as f32).collect(),
+        action: (0..24).map(|x| 0.125 * (x / 4) as f32).collect(),
         reward: vec![0.0; 6],
         terminal: vec![false; 6],
         first: first.to_vec(),
@@ -309,7 +309,7 @@ fn the_action_of_a_state_is_the_one_that_led_to_the_next_image() {
     let batch = batch.into_tensors(&Device::Cpu).unwrap();
     let (features, actions) = Examples::of_batch(&features, &batch).unwrap();
     assert_eq!(features.flatten_all().unwrap().to_vec1::<f32>().unwrap(), [0.0, 4.0]);
-    assert_eq!(actions.to_vec2::<f32>().unwrap(), [[0.01; 4], [0.05; 4]]);
+    assert_eq!(actions.to_vec2::<f32>().unwrap(), [[0.125; 4], [0.625; 4]]);
 }
 
 #[test]
