@@ -12,7 +12,7 @@ import time
 import iceoryx2 as iox2
 
 IMAGE_SIDE = 64
-FIRST, LAST, TERMINAL, SUCCESS, MASK_VALID, ACTION_HELD, REPEATED = (1 << bit for bit in range(7))
+FIRST, LAST, TERMINAL, SUCCESS, MASK_VALID, ACTION_HELD, REPEATED, PUSHED = (1 << bit for bit in range(8))
 SOURCES = ("policy", "imagined", "fallback")
 OWN_TASK = 0xFFFF_FFFF
 

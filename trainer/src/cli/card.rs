@@ -1,15 +1,12 @@
 use std::path::{Path, PathBuf};
 use std::process::ExitCode;
 
-use anyhow::{Context, Result, ensure};
+use anyhow::{Result, ensure};
 use rcwm_models::bundle::Bundle;
-use rcwm_models::files::{read_capped, write_atomic};
+use rcwm_models::files::write_atomic;
 use rcwm_trainer::checkpoint::CheckpointSettings;
-use rcwm_trainer::training::{Phase, Run, TrainingSettings};
-use serde::Deserialize;
-
-/// Largest file of results that is read, in bytes.
-const RESULTS_BYTES_MAX: u64 = 64 << 20;
+use rcwm_trainer::evaluation::{ClosedLoopReport, ClosedLoopResults, ClosedLoopSettings};
+use rcwm_trainer::training::{Phase, Run, TrainingSettings, demonstrations};
 
 /// Write a bundle's card: what it learnt from, what that cost, how often it succeeds
 #[derive(Debug, clap::Args)]
@@ -34,35 +31,6 @@ pub struct Card {
     film: Option<String>,
 }
 
-#[derive(Debug, Deserialize)]
-struct Results {
-    tasks: Vec<Scored>,
-}
-
-#[derive(Debug, Deserialize)]
-struct Scored {
-    settings: Scoring,
-    episodes: u64,
-    successes: u64,
-    success_rate: f64,
-    interval: Interval,
-    return_mean: f64,
-    return_std: f64,
-}
-
-#[derive(Debug, Deserialize)]
-struct Scoring {
-    task: String,
-    seed: u64,
-    disturb: String,
-}
-
-#[derive(Debug, Deserialize)]
-struct Interval {
-    low: f64,
-    high: f64,
-}
-
 impl Card {
     pub fn run(self) -> Result<ExitCode> {
         let bundle = Bundle::open(&self.bundle)?;
@@ -75,10 +43,14 @@ impl Card {
         );
         let learnt = checkpoint(&Run::last(&self.run))?;
         let pretrained = checkpoint(&settings.from).ok();
-        let text = read_capped(&self.success, RESULTS_BYTES_MAX)?;
-        let results: Results = serde_json::from_slice(&text).with_context(|| {
-            format!("--success {}: no results of evaluate --task", self.success.display())
-        })?;
+        let (results, _) = ClosedLoopResults::read(&self.success)?;
+        ensure!(
+            results.tasks.iter().any(|scored| scored.settings.task == bundle.manifest.task),
+            "--success {}: no result on {}, the bundle's task; run evaluate --bundle {} --task {1} --json FILE",
+            self.success.display(),
+            bundle.manifest.task,
+            self.bundle.display()
+        );
         let path = self.bundle.join("README.md");
         let card = self.card(&bundle, &settings, &learnt, pretrained.as_ref(), &results)?;
         write_atomic(&path, card.as_bytes())?;
@@ -92,7 +64,7 @@ impl Card {
         settings: &TrainingSettings,
         learnt: &CheckpointSettings,
         pretrained: Option<&CheckpointSettings>,
-        results: &Results,
+        results: &ClosedLoopResults,
     ) -> Result<String> {
         let (task, model) = (&bundle.manifest.task, &learnt.model);
         let mut card = format!("# {task}\n\n");
@@ -106,17 +78,18 @@ impl Card {
         }
         card += "| | |\n| --- | --- |\n";
         for scored in &results.tasks {
-            card += &scored.row();
+            card += &row(scored);
         }
         let (fewshot, kind) = (&settings.fewshot, format!("{:?}", model.kind).to_lowercase());
         card += &format!(
-            "| demonstrations | {}, of the scripted expert |\n| updates | {} of the environment's side, {} of the whole world model, both with \
-             the actor; {} of the actor alone |\n| processor time | {:.0} minutes, of all cores together |\n",
-            fewshot.demonstrations,
+            "| demonstrations | {} |\n| updates | {} of the environment's side, {} of the whole world model{}; {} of the actor alone |\n\
+             | processor time | {} |\n",
+            demonstrated(settings),
             fewshot.environment_updates,
             fewshot.world_updates,
+            if fewshot.imitation_scale > 0.0 { ", both with the actor" } else { "" },
             fewshot.actor_updates,
-            learnt.cpu_seconds / 60.0
+            processor_time(learnt)
         );
         card += &format!(
             "| model | {}, depth {}, {} x {} latents, width {} |\n",
@@ -124,39 +97,70 @@ impl Card {
         );
         if let Some(pretrained) = pretrained {
             card += &format!(
-                "| pre-trained | {} updates on the four upstream tasks, {:.0} minutes of processor time |\n",
+                "| pre-trained | {} updates on {}; processor time: {} |\n",
                 pretrained.updates,
-                pretrained.cpu_seconds / 60.0
+                pretrained.data,
+                processor_time(pretrained)
             );
         }
         let seed = settings.seed;
         card += &format!("| seed | {seed} |\n\n");
-        card += &format!(
-            "Success counts where the task was solved at any step of the episode; the layouts of scoring were in no demonstration. Check and \
-             run it:\n\n```sh\nrcwm-runtime verify --bundle {0}\nrcwm-trainer evaluate --bundle {0} --task {task} --episodes 50 --seed {1}\n```\n",
-            format_args!("models/bundles/{task}"),
-            results.tasks.first().map_or(0, |scored| scored.settings.seed),
-        );
+        card += "Success counts where the task was solved at any step of the episode. Check and score it; BUNDLE is this folder:\n\n```sh\n\
+                 rcwm-runtime verify --bundle BUNDLE\n";
+        for ClosedLoopReport { settings, episodes, .. } in &results.tasks {
+            let ClosedLoopSettings { task, seed, disturb, .. } = settings;
+            card += &format!(
+                "rcwm-trainer evaluate --bundle BUNDLE --task {task} --episodes {episodes} --seed {seed} --disturb {disturb}\n"
+            );
+        }
+        card += "```\n";
         Ok(card)
     }
 }
 
-impl Scored {
-    fn row(&self) -> String {
-        let Scoring { task, seed, disturb } = &self.settings;
-        let disturbed = if disturb == "none" { String::new() } else { format!(", {disturb} disturbed") };
-        let percent = |x: f64| format!("{:.0}%", 100.0 * x);
-        format!(
-            "| success, {task}{disturbed} | **{}** ({} of {}; 95% {} to {}), return {:.0} +- {:.0}, seed {seed} |\n",
-            percent(self.success_rate),
-            self.successes,
-            self.episodes,
-            percent(self.interval.low),
-            percent(self.interval.high),
-            self.return_mean,
-            self.return_std
-        )
+fn processor_time(checkpoint: &CheckpointSettings) -> String {
+    match checkpoint.cpu_seconds {
+        0.0 => "not known".to_owned(),
+        seconds => format!("{:.0} minutes, of all cores together", seconds / 60.0),
     }
+}
+
+fn row(scored: &ClosedLoopReport) -> String {
+    let ClosedLoopSettings { task, seed, disturb, .. } = &scored.settings;
+    let disturbed = if disturb == "none" { String::new() } else { format!(", {disturb} disturbed") };
+    let percent = |x: f64| format!("{:.0}%", 100.0 * x);
+    format!(
+        "| success, {task}{disturbed} | **{}** ({} of {}; 95% {} to {}), return {:.0} +- {:.0}, seed {seed} |\n",
+        percent(scored.success_rate),
+        scored.successes,
+        scored.episodes,
+        percent(scored.interval.low),
+        percent(scored.interval.high),
+        scored.return_mean,
+        scored.return_std
+    )
+}
+
+/// How many demonstrations were learnt from, and what they were where they are still there.
+fn demonstrated(settings: &TrainingSettings) -> String {
+    let count = settings.fewshot.demonstrations;
+    let Ok(replay) = demonstrations(
+        &settings.data,
+        &settings.task,
+        &settings.fewshot,
+        settings.replay.capacity_steps,
+        || (),
+    ) else {
+        return format!("at most {count}");
+    };
+    let episodes = || replay.tasks().flat_map(|(_, episodes)| episodes);
+    let pushed: usize =
+        episodes().map(|episode| episode.pushed.iter().filter(|pushed| **pushed).count()).sum();
+    format!(
+        "{}, of {} steps; in {pushed} of these the demonstrator was pushed off course, to show how to recover",
+        replay.episodes(),
+        replay.steps()
+    )
 }
 
 fn checkpoint(folder: &Path) -> Result<CheckpointSettings> {

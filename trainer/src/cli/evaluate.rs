@@ -10,15 +10,15 @@ use rcwm_models::bundle::PartName;
 use rcwm_models::tasks::task_id;
 use rcwm_trainer::checkpoint::Checkpoint;
 use rcwm_trainer::evaluation::{
-    ClosedLoopReport, ClosedLoopSettings, Comparison, Latents, Measure, Measured, ModelReport,
-    OpenLoopReport, OpenLoopSettings, Position, TaskReport, TaskTrajectories, closed_loop, measure,
+    ClosedLoopReport, ClosedLoopResults, ClosedLoopSettings, Comparison, Latents, Measure, Measured,
+    ModelReport, OpenLoopReport, OpenLoopSettings, Position, TaskReport, TaskTrajectories, closed_loop,
+    measure,
 };
 use rcwm_trainer::export::{self, ExportError, Options};
 use rcwm_trainer::model::agent::Agent;
 use rcwm_trainer::plots;
 use rcwm_trainer::replay::Folder;
 use rcwm_trainer::report::shown_path;
-use serde::Serialize;
 
 use super::report::{Inputs, ReportArguments};
 
@@ -295,8 +295,8 @@ impl Evaluate {
             println!("{}", describe(&report));
             reports.push(report);
         }
-        let of = self.bundle.as_ref().or(self.checkpoints.first());
-        let outcome = ClosedLoop { of, tasks: reports };
+        let of = self.bundle.as_ref().or(self.checkpoints.first()).cloned();
+        let outcome = ClosedLoopResults { of, tasks: reports };
         self.json.as_deref().map_or(Ok(()), |file| super::write_json(file, &outcome))
     }
 
@@ -344,13 +344,6 @@ impl export::Progress for Stop<'_> {
     fn step(&self, _what: &str, _done: usize, _total: usize) -> Result<(), ExportError> {
         if self.0.load(Ordering::Relaxed) { Err(ExportError::Interrupted) } else { Ok(()) }
     }
-}
-
-/// What is written with `--json`.
-#[derive(Serialize)]
-struct ClosedLoop<'a> {
-    of: Option<&'a PathBuf>,
-    tasks: Vec<ClosedLoopReport>,
 }
 
 fn episodes_bar(episodes: u64, steps_max: u32, task: &str) -> Result<ProgressBar> {

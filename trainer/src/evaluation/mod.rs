@@ -13,11 +13,13 @@
 //! | `report` | means, spreads and intervals; the table and the plots |
 //! | `statistics` | bootstrap over episodes, Wilson's interval |
 //! | `closed_loop` | success rate of the exported policy, by simulators and runtimes |
+//! | `closed_loop_results` | that, in the file that `--json` writes |
 //! | `film` | what was imagined, as a strip and animated |
 //! | `attention` | what the environment asks of the robot while a step is imagined |
 
 mod attention;
 mod closed_loop;
+mod closed_loop_results;
 mod film;
 mod measures;
 mod open_loop;
@@ -30,6 +32,7 @@ pub use attention::{Attention, AttentionFilm};
 pub use closed_loop::{
     ClosedLoopError, ClosedLoopReport, ClosedLoopSettings, Position, closed_loop, recorded_episode,
 };
+pub use closed_loop_results::{ClosedLoopResults, ClosedLoopResultsError};
 pub use film::Film;
 pub use measures::{Measure, Trace, traces};
 pub use open_loop::{filtered, imagined, joined, open_loop};

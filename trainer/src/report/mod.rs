@@ -37,7 +37,7 @@ use rcwm_models::bundle::BundleError;
 use rcwm_models::files::FileError;
 
 use crate::checkpoint::CheckpointError;
-use crate::evaluation::{ClosedLoopError, EvaluationError};
+use crate::evaluation::{ClosedLoopError, ClosedLoopResultsError, EvaluationError};
 use crate::plots::PlotError;
 
 /// Why there is no report.
@@ -82,7 +82,10 @@ pub enum ReportError {
         task: String,
     },
     /// A result file is none.
-    #[error("--results {path}: {reason}; expected what `evaluate --task ... --json` writes")]
+    #[error(transparent)]
+    ResultsFile(#[from] ClosedLoopResultsError),
+    /// A result file cannot be taken.
+    #[error("--results {path}: {reason}")]
     Results {
         /// The file.
         path: PathBuf,

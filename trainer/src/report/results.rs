@@ -1,14 +1,11 @@
 use std::collections::BTreeMap;
 use std::path::{Path, PathBuf};
 
-use rcwm_models::files::{read_capped, sha256_hex};
+use rcwm_models::files::sha256_hex;
 use serde::{Deserialize, Serialize};
 
 use super::{Measurement, ReportError, shown_path};
-use crate::evaluation::{ClosedLoopReport, Interval, mean_and_std, wilson};
-
-/// Largest result file that is read, in bytes.
-const FILE_BYTES_MAX: u64 = 256 << 20;
+use crate::evaluation::{ClosedLoopResults, Interval, mean_and_std, wilson};
 
 /// The result files that were given last.
 #[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
@@ -77,13 +74,6 @@ impl Measurement for Results {
     }
 }
 
-/// The part of a result file that is read.
-#[derive(Deserialize)]
-struct File {
-    of: Option<PathBuf>,
-    tasks: Vec<ClosedLoopReport>,
-}
-
 impl Results {
     /// Reads labelled result files.
     ///
@@ -94,8 +84,7 @@ impl Results {
         let mut entries = Vec::new();
         for (label, path) in files {
             let wrong = |reason: String| ReportError::Results { path: path.clone(), reason };
-            let bytes = read_capped(path, FILE_BYTES_MAX)?;
-            let file: File = serde_json::from_slice(&bytes).map_err(|error| wrong(error.to_string()))?;
+            let (file, bytes) = ClosedLoopResults::read(path)?;
             let known = (label.clone(), sha256_hex(&bytes));
             if source.files.contains(&known) {
                 return Err(wrong(format!("was given twice as {label:?}: its episodes would count twice")));
