@@ -115,6 +115,8 @@ class Environment:
         mujoco.mj_resetData(self.model, self.data)
         mujoco.mj_forward(self.model, self.data)
         self.observation, _ = self.env.reset()
+        # Tasks move their goal last: without this the first picture shows it in another place.
+        mujoco.mj_forward(self.model, self.data)
         if self.look is not None:
             self.look.change(self.look_random)
         self._observe(0.0, False)

@@ -66,6 +66,26 @@ fn an_unknown_task_is_refused_with_near_names() {
     assert!(error.to_string().contains("hammer"), "{error}");
 }
 
+/// The goal of reach is a few pixels that no physics moves: between two pictures nothing may change but the robot.
+#[test]
+fn the_first_picture_shows_the_goal_where_it_stays() {
+    let reach = Environment::open(settings("reach")).unwrap();
+    for episode in 0..5 {
+        reach.reset(episode).unwrap();
+        let before = see(&reach).0;
+        reach.step([0.0; ACTION_LEN]).unwrap();
+        let after = see(&reach).0;
+        let robot = |pixel: usize| before.robot_mask[pixel] > 0 || after.robot_mask[pixel] > 0;
+        let picture = |seen: &Observation, pixel: usize| -> [u8; 3] {
+            seen.image[3 * pixel..3 * (pixel + 1)].try_into().unwrap()
+        };
+        let changed = (0..IMAGE_SIDE * IMAGE_SIDE)
+            .filter(|pixel| !robot(*pixel) && picture(&before, *pixel) != picture(&after, *pixel))
+            .count();
+        assert_eq!(changed, 0, "pixels beside the robot changed in episode {episode}");
+    }
+}
+
 #[test]
 fn an_episode_depends_on_its_number_and_not_on_the_ones_before() {
     let (one, other) = (Environment::open(settings("hammer")), Environment::open(settings("hammer")));

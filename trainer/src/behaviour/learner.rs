@@ -143,9 +143,10 @@ impl BehaviourLearner {
         start: &State,
         sampler: &mut Sampler,
     ) -> candle_core::Result<Vec<Imagination>> {
-        let rows = start.branches.first().map_or(Ok(0), |latent| latent.h.dim(0))?;
+        let Some(first) = start.branches.first() else { return Ok(Vec::new()) };
+        let rows = first.h.dim(0)?;
         let whole = &*sampler;
-        let shares = ops::in_parallel(ops::shares_of(rows), |share: Range<usize>| {
+        let shares = ops::in_parallel(ops::shares_of(rows, first.h.device()), |share: Range<usize>| {
             let mut sampler = whole.share(share.clone(), rows);
             Ok((self.imagine(&start.rows(&share)?, &mut sampler)?, sampler))
         });

@@ -129,7 +129,7 @@ impl WorldLearner {
             })?;
             Ok::<_, LearningError>(((weight, losses.detached()), gradients, sampler))
         };
-        let shares = ops::in_parallel(ops::shares_of(rows), share);
+        let shares = ops::in_parallel(ops::shares_of(rows, batch.image.device()), share);
         let (mut losses, mut gradients) = (Vec::new(), Vec::new());
         let mut followed = None;
         for share in shares {

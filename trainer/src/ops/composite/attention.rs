@@ -10,7 +10,8 @@ use super::softmax;
 /// Those of candle (shapes, devices).
 pub fn cross_attention(queries: &Tensor, keys: &Tensor, values: &Tensor) -> Result<(Tensor, Tensor)> {
     let scale = 1.0 / (queries.dim(D::Minus1)? as f64).sqrt();
-    let scores = (queries.matmul(&keys.transpose(1, 2)?)? * scale)?; // [B, n, r]
+    let keys = keys.contiguous()?.transpose(1, 2)?;
+    let scores = (queries.contiguous()?.matmul(&keys)? * scale)?; // [B, n, r]
     let attention = softmax(&scores)?;
-    Ok((attention.matmul(values)?, attention))
+    Ok((attention.matmul(&values.contiguous()?)?, attention))
 }

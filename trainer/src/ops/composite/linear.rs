@@ -8,7 +8,8 @@ pub fn linear(x: &Tensor, weight: &Tensor, bias: Option<&Tensor>) -> Result<Tens
     let (out, width) = weight.dims2()?;
     let mut shape = x.dims().to_vec();
     let rows = x.elem_count() / x.dim(D::Minus1)?.max(1);
-    let y = x.reshape((rows, width))?.matmul(&weight.t()?)?;
+    // A GPU multiplies whole matrices only, no slices of the columns of a larger one.
+    let y = x.reshape((rows, width))?.matmul(&weight.contiguous()?.t()?)?;
     let y = match bias {
         Some(bias) => y.broadcast_add(bias)?,
         None => y,

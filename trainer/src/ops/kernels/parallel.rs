@@ -4,6 +4,8 @@ use std::cell::Cell;
 use std::ops::Range;
 use std::sync::OnceLock;
 
+use candle_core::Device;
+
 thread_local! {
     /// Threads that a task may use, where it is one of several.
     static GRANTED: Cell<Option<usize>> = const { Cell::new(None) };
@@ -35,9 +37,9 @@ pub fn in_parallel<I: Send, T: Send>(items: Vec<I>, body: impl Fn(I) -> T + Sync
     results.into_iter().map(|result| result.expect("every task has run to its end")).collect()
 }
 
-/// Shares of `count` items for [`in_parallel`]: one a thread, none empty.
-pub fn shares_of(count: usize) -> Vec<Range<usize>> {
-    shares(count, 1)
+/// Shares of `count` items for [`in_parallel`]: one a thread, none empty. A GPU is fast with all of them at once.
+pub fn shares_of(count: usize, device: &Device) -> Vec<Range<usize>> {
+    if device.is_cpu() { shares(count, 1) } else { std::iter::once(0..count).collect() }
 }
 
 /// Leaves the cores to the fused ops: candle's own elementwise operations then run on the calling thread. Its pool spins between
@@ -118,7 +120,7 @@ mod tests {
     #[test]
     fn tasks_give_their_results_in_order_and_divide_the_threads() {
         let all = threads();
-        let found = in_parallel(shares_of(5), |share| (share.start, threads()));
+        let found = in_parallel(shares_of(5, &Device::Cpu), |share| (share.start, threads()));
         assert!(found.is_sorted() && found.iter().all(|(_, granted)| granted * found.len() <= all.max(1)));
         assert_eq!(threads(), all);
     }
