@@ -9,6 +9,7 @@ SEED ?= 1
 OUT ?= runs/demo
 PRETRAINED ?= models/small
 DEMONSTRATIONS ?= 50
+DEMONSTRATOR ?= pushed
 LEARNT ?= runs/learn/$(TASK)
 BIN = $${CARGO_TARGET_DIR:-target}/release
 
@@ -25,7 +26,7 @@ demo: ## A trained policy (TASK=hammer) over shared memory: summary and films in
 learn: ## A new task (TASK=coffee-pull) from 50 demonstrations, deployed and scored: policy, film and figures in runs/learn/TASK
 	@scripts/setup demo
 	$(CARGO) build --release --locked -p rcwm-simulator -p rcwm-runtime -p rcwm-trainer
-	@scripts/learn "$(TASK)" "$(PRETRAINED)" "$(LEARNT)" "$(DEMONSTRATIONS)" 50
+	@scripts/learn "$(TASK)" "$(PRETRAINED)" "$(LEARNT)" "$(DEMONSTRATIONS)" 50 "$(DEMONSTRATOR)"
 
 test: ## Everything that can be tested on one machine
 	@scripts/setup test

@@ -63,6 +63,32 @@ fn a_policy_is_judged_by_whole_episodes_and_nothing_is_left_behind() {
 }
 
 #[test]
+fn the_trainer_decides_what_the_runtime_decides_and_judges_what_no_runtime_deploys() {
+    let (domain, folder) = (Domain::new(), tempfile::tempdir().unwrap());
+    let judged = |model: &str, engine: &str| {
+        let checkpoint = checkpoint(&domain, &folder.path().join(engine), model);
+        let rest =
+            ["--episodes", "3", "--steps-max", "8", "--seed", "5", "--simulators", "2", "--engine", engine];
+        let mut command = evaluate(&domain, &checkpoint, &rest);
+        let file = folder.path().join(format!("{model}-{engine}.json"));
+        command.arg("--json").arg(&file);
+        Running::start(command).succeed();
+        read_json(&file)["tasks"][0].clone()
+    };
+    let returns = |report: &serde_json::Value| -> Vec<f64> {
+        report["returns"].as_array().unwrap().iter().map(|x| x.as_f64().unwrap()).collect()
+    };
+    let (runtime, trainer) = (judged("rcwm", "tract"), judged("rcwm", "trainer"));
+    assert_eq!(trainer["settings"]["engine"], "trainer");
+    for (a, b) in returns(&runtime).into_iter().zip(returns(&trainer)) {
+        assert!((a - b).abs() < 1e-3 * a.abs().max(1.0), "return {a} by the runtime, {b} by the trainer");
+    }
+    let vanilla = judged("vanilla", "tract");
+    assert_eq!((&vanilla["settings"]["engine"], vanilla["episodes"].as_u64()), (&"trainer".into(), Some(3)));
+    assert_eq!(vanilla["steps"].as_u64(), Some(24));
+}
+
+#[test]
 fn ctrl_c_ends_simulators_and_runtimes_too() {
     let (domain, folder) = (Domain::new(), tempfile::tempdir().unwrap());
     let checkpoint = checkpoint(&domain, folder.path(), "rcwm");

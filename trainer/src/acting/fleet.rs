@@ -4,6 +4,7 @@ use rcwm_models::ACTION_LEN;
 use rcwm_models::episode::{Episode, EpisodeBuilder, EpisodeError};
 use rcwm_models::wire::{ObservationFlags, ObservationSample};
 
+use super::policy::Seen;
 use crate::simulators::{Client, ClientError, Launch, SimulatorProcess};
 
 /// Why acting in simulators failed.
@@ -41,6 +42,17 @@ impl Gathered {
     #[must_use]
     pub fn is_first(&self) -> bool {
         self.observation.is(ObservationFlags::FIRST)
+    }
+
+    /// What a policy decides by.
+    #[must_use]
+    pub fn seen(&self) -> Seen<'_> {
+        Seen {
+            simulator: self.simulator,
+            first: self.is_first(),
+            image: &self.observation.image,
+            executed: self.observation.executed_action,
+        }
     }
 
     /// Whether it is the last of its episode.

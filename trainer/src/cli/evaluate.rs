@@ -7,12 +7,13 @@ use anyhow::{Context, Result, ensure};
 use candle_core::Device;
 use indicatif::{ProgressBar, ProgressStyle};
 use rcwm_models::bundle::PartName;
+use rcwm_models::settings::ModelKind;
 use rcwm_models::tasks::task_id;
 use rcwm_trainer::checkpoint::Checkpoint;
 use rcwm_trainer::evaluation::{
     ClosedLoopReport, ClosedLoopResults, ClosedLoopSettings, Comparison, Latents, Measure, Measured,
-    ModelReport, OpenLoopReport, OpenLoopSettings, Position, TaskReport, TaskTrajectories, closed_loop,
-    measure,
+    ModelReport, OpenLoopReport, OpenLoopSettings, Position, TRAINER_ENGINE, TaskReport, TaskTrajectories,
+    closed_loop, closed_loop_in_trainer, measure,
 };
 use rcwm_trainer::export::{self, ExportError, Options};
 use rcwm_trainer::model::agent::Agent;
@@ -39,7 +40,7 @@ With --data (paper, Fig. 4 and 7): every model sees some steps of the same traje
 imagines the rest with the recorded actions. The robot dynamics error is the squared error between
 imagined and true picture, both multiplied by the true robot mask, mean over the whole picture;
 the episodes need masks. With --task: the policy is exported and deployed by rcwm-runtime in
-rcwm-simulator, in lock-step. With --report: both, as one page that shows all that lies in the
+rcwm-simulator, in lock-step; a vanilla model, which no runtime deploys, decides here. With --report: both, as one page that shows all that lies in the
 folder's parts; a part is measured again only if it is asked for from something else. Ctrl-C keeps
 what is done.")]
 #[command(group = clap::ArgGroup::new("on").required(true).multiple(true).args(["data", "tasks", "report"]))]
@@ -86,8 +87,8 @@ pub struct Evaluate {
     /// Visual disturbance (repeatable; a report always has none too)
     #[arg(long, default_value = "none", value_parser = ["none", "textures", "noise"])]
     disturb: Vec<String>,
-    /// The runtime's engine
-    #[arg(long, default_value = "tract", value_parser = ["tract", "ort"])]
+    /// The runtime's engine, or the trainer itself in a runtime's place
+    #[arg(long, default_value = "tract", value_parser = ["tract", "ort", TRAINER_ENGINE])]
     engine: String,
     /// Simulators at a time, each with a runtime
     #[arg(long, default_value_t = 1, value_name = "N", value_parser = clap::value_parser!(u64).range(1..=256))]
@@ -276,9 +277,12 @@ impl Evaluate {
         }
         ensure!(self.checkpoints.len() < 2, "--task takes one --checkpoint; run one after the other");
         let folder = tempfile::tempdir().context("temporary folder for the bundle")?;
-        let bundle = match (&self.bundle, self.checkpoints.first()) {
-            (Some(bundle), _) => std::path::absolute(bundle)?,
-            (None, Some(checkpoint)) => self.exported(checkpoint, folder.path(), stop)?,
+        let policy = match (&self.bundle, self.checkpoints.first()) {
+            (Some(_), _) if self.engine == TRAINER_ENGINE => {
+                anyhow::bail!("--engine trainer runs a --checkpoint, no --bundle; give its run's checkpoint")
+            }
+            (Some(bundle), _) => Deployed::Bundle(std::path::absolute(bundle)?),
+            (None, Some(checkpoint)) => self.deployed(checkpoint, folder.path(), stop)?,
             (None, None) => anyhow::bail!("give --checkpoint or --bundle"),
         };
         let mut reports = Vec::new();
@@ -289,7 +293,11 @@ impl Evaluate {
                 let steps = |at: &Position| at.episodes * u64::from(self.steps_max) + u64::from(at.steps);
                 bar.set_position(positions.iter().map(steps).sum());
             };
-            let report = closed_loop(&bundle, &self.loop_settings(task, disturb), stop, show);
+            let settings = self.loop_settings(task, disturb);
+            let report = match &policy {
+                Deployed::Bundle(bundle) => closed_loop(bundle, &settings, stop, show),
+                Deployed::Here(checkpoint) => closed_loop_in_trainer(checkpoint, &settings, stop, show),
+            };
             bar.finish_and_clear();
             let report = report?;
             println!("{}", describe(&report));
@@ -315,9 +323,12 @@ impl Evaluate {
         }
     }
 
-    /// Exports a checkpoint's policy into `folder`.
-    fn exported(&self, checkpoint: &Path, folder: &Path, stop: &AtomicBool) -> Result<PathBuf> {
+    /// Exports a checkpoint's policy into `folder`, if a runtime deploys its kind.
+    fn deployed(&self, checkpoint: &Path, folder: &Path, stop: &AtomicBool) -> Result<Deployed> {
         let checkpoint = Checkpoint::read(checkpoint, &Device::Cpu)?;
+        if checkpoint.settings.model.kind == ModelKind::Vanilla || self.engine == TRAINER_ENGINE {
+            return Ok(Deployed::Here(Box::new(checkpoint)));
+        }
         let place = folder.join("bundle");
         let options = Options {
             task: self.tasks.first().cloned().unwrap_or_default(),
@@ -330,8 +341,16 @@ impl Evaluate {
             replace: false,
         };
         export::write(&checkpoint, &place, &options, &Stop(stop))?;
-        Ok(place)
+        Ok(Deployed::Bundle(place))
     }
+}
+
+/// Where a policy decides.
+enum Deployed {
+    /// In a runtime.
+    Bundle(PathBuf),
+    /// In this process.
+    Here(Box<Checkpoint>),
 }
 
 /// Steps from one picture of a strip to the next.

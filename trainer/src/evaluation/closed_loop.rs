@@ -10,6 +10,8 @@ use rcwm_models::wire::{LinkError, LinkSettings, ObserverLink, Wait, forget_pref
 use serde::{Deserialize, Serialize};
 
 use super::statistics::{Interval, mean_and_std, wilson};
+use crate::acting::FleetError;
+use crate::model::parameters::ParameterError;
 use crate::simulators::{ProcessError, Program, RunningProgram};
 
 /// A simulator or runtime whose other side is gone ends by itself after so many seconds.
@@ -75,6 +77,15 @@ pub enum ClosedLoopError {
         /// Its number.
         number: u64,
     },
+    /// Acting in this process failed.
+    #[error(transparent)]
+    Acting(#[from] FleetError),
+    /// The model does not fit its sizes.
+    #[error(transparent)]
+    Model(#[from] ParameterError),
+    /// The model could not be computed.
+    #[error(transparent)]
+    Tensor(#[from] candle_core::Error),
     /// It was stopped.
     #[error("interrupted; the simulators and runtimes were ended")]
     Interrupted,
@@ -93,7 +104,7 @@ pub struct ClosedLoopSettings {
     pub steps_max: u32,
     /// Visual disturbance: `none`, `textures` or `noise`.
     pub disturb: String,
-    /// The runtime's engine: `tract` or `ort`.
+    /// The runtime's engine: `tract` or `ort`; `trainer` where no runtime took part.
     pub engine: String,
     /// Whether latents and actions are drawn instead of the most probable ones.
     pub sample: bool,
@@ -144,11 +155,11 @@ pub struct Position {
 }
 
 /// The part of a simulator's summary that is read.
-#[derive(Debug, Deserialize)]
-struct Served {
-    returns: Vec<f64>,
-    successful: Vec<bool>,
-    steps: u64,
+#[derive(Debug, Default, Deserialize)]
+pub(super) struct Served {
+    pub(super) returns: Vec<f64>,
+    pub(super) successful: Vec<bool>,
+    pub(super) steps: u64,
 }
 
 /// Runs a bundle's policy in simulators, in lock-step, and counts its successes. `seen` hears how far each simulator is.
@@ -161,10 +172,7 @@ pub fn closed_loop(
     stop: &AtomicBool,
     mut seen: impl FnMut(&[Position]),
 ) -> Result<ClosedLoopReport, ClosedLoopError> {
-    let loops = settings.simulators.clamp(1, settings.episodes.max(1));
-    let share = |number: u64| settings.episodes * number / loops;
-    let shares: Vec<_> = (0..loops).map(|number| share(number)..share(number + 1)).collect();
-    run(bundle, settings, &shares, None, stop, &mut seen)
+    run(bundle, settings, &settings.shares(), None, stop, &mut seen)
 }
 
 /// Runs one episode of those that [`closed_loop`] runs with the same settings, and records it. Without sampling it is the same one,
@@ -229,8 +237,17 @@ fn run(
     Ok(ClosedLoopReport::new(settings.clone(), &served, runtimes, begin.elapsed()))
 }
 
+impl ClosedLoopSettings {
+    /// The episodes of each simulator.
+    pub(super) fn shares(&self) -> Vec<Range<u64>> {
+        let simulators = self.simulators.clamp(1, self.episodes.max(1));
+        let share = |number: u64| self.episodes * number / simulators;
+        (0..simulators).map(|number| share(number)..share(number + 1)).collect()
+    }
+}
+
 impl ClosedLoopReport {
-    fn new(
+    pub(super) fn new(
         settings: ClosedLoopSettings,
         served: &[Served],
         runtimes: Vec<serde_json::Value>,

@@ -13,12 +13,14 @@
 //! | `report` | means, spreads and intervals; the table and the plots |
 //! | `statistics` | bootstrap over episodes, Wilson's interval |
 //! | `closed_loop` | success rate of the exported policy, by simulators and runtimes |
+//! | `closed_loop_in_trainer` | the same of a model that no runtime deploys |
 //! | `closed_loop_results` | that, in the file that `--json` writes |
 //! | `film` | what was imagined, as a strip and animated |
 //! | `attention` | what the environment asks of the robot while a step is imagined |
 
 mod attention;
 mod closed_loop;
+mod closed_loop_in_trainer;
 mod closed_loop_results;
 mod film;
 mod measures;
@@ -32,6 +34,7 @@ pub use attention::{Attention, AttentionFilm};
 pub use closed_loop::{
     ClosedLoopError, ClosedLoopReport, ClosedLoopSettings, Position, closed_loop, recorded_episode,
 };
+pub use closed_loop_in_trainer::{TRAINER_ENGINE, closed_loop_in_trainer};
 pub use closed_loop_results::{ClosedLoopResults, ClosedLoopResultsError};
 pub use film::Film;
 pub use measures::{Measure, Trace, traces};

@@ -169,6 +169,7 @@ fn run_job(
         policy: job.script.name(),
         masks: job.masks,
         disturb: settings.disturb.clone(),
+        program: None,
         silence_max: SILENCE_MAX,
     })?;
     let mut recorder = Recorder::new(Client::of(process)?);

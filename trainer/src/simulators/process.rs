@@ -117,6 +117,8 @@ pub struct Launch {
     pub masks: bool,
     /// `none`, `textures` or `noise`.
     pub disturb: String,
+    /// The simulator's path; where there is none it is searched for.
+    pub program: Option<PathBuf>,
     /// Ends by itself after so long without an answer: a trainer that was killed leaves no simulator behind.
     pub silence_max: Duration,
 }
@@ -135,6 +137,7 @@ impl Launch {
             policy: "remote",
             masks: false,
             disturb: "none".to_owned(),
+            program: None,
             silence_max: Duration::from_secs(600),
         }
     }
@@ -154,7 +157,10 @@ impl SimulatorProcess {
     /// # Errors
     /// [`ProcessError::Missing`] or [`ProcessError::Start`].
     pub fn start(launch: &Launch) -> Result<Self, ProcessError> {
-        let mut command = Command::new(Program::SIMULATOR.find()?);
+        let mut command = Command::new(match &launch.program {
+            Some(path) => path.clone(),
+            None => Program::SIMULATOR.find()?,
+        });
         command
             .args(["serve", "--pace", "lockstep", "--task", &launch.task, "--instance", &launch.instance])
             .args(["--policy", launch.policy, "--disturb", &launch.disturb])

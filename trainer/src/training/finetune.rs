@@ -10,7 +10,7 @@ use super::prefill::{Prefilled, policy_episode, prefill};
 use super::run::GoesOn;
 use super::{EpisodeFacts, EpisodeLine, OnlineOutcome, OnlineProgress};
 use super::{Interval, Phase, Run, Spent, TrainingError, TrainingSettings, TrainingState, start_from};
-use crate::acting::{Fleet, Gathered, Policy, Recorded, Seen as Sight};
+use crate::acting::{Fleet, Gathered, Policy, Recorded};
 use crate::behaviour::BehaviourLearner;
 use crate::checkpoint::Checkpoint;
 use crate::learning::{Trained, WorldLearner};
@@ -234,7 +234,7 @@ impl Finetuning {
         policy: &mut Policy,
     ) -> Result<(), TrainingError> {
         let going_on: Vec<_> = gathered.iter().filter(|one| !one.is_last()).collect();
-        let seen: Vec<_> = going_on.iter().map(|one| sight(one)).collect();
+        let seen: Vec<_> = going_on.iter().map(|one| one.seen()).collect();
         let mut sampler = Sampler::numbered(self.settings.seed ^ ACTING_STREAM, self.state.policy_steps);
         let decisions = policy.decide(&seen, &mut sampler)?;
         for (one, decision) in going_on.into_iter().zip(&decisions) {
@@ -409,16 +409,6 @@ const ONLINE: &str = "online";
 struct Learning {
     batches: Prefetch,
     interval: Interval,
-}
-
-fn sight(gathered: &Gathered) -> Sight<'_> {
-    let observation = &gathered.observation;
-    Sight {
-        simulator: gathered.simulator,
-        first: gathered.is_first(),
-        image: &observation.image,
-        executed: observation.executed_action,
-    }
 }
 
 /// Refuses a model with a number that is not finite.

@@ -106,7 +106,7 @@ impl FewshotSettings {
             Preset::Small => Self {
                 steps_after_success: 30,
                 environment_updates: 100,
-                world_updates: 1100,
+                world_updates: 2200,
                 actor_updates: 4000,
                 imitation_scale: 100.0,
                 starts: Starts::Episodes,
