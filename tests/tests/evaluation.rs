@@ -194,14 +194,15 @@ fn assert_self_contained(report: &Path, folder: &Path) {
 #[test]
 fn what_cannot_be_judged_is_one_clear_error() {
     let (domain, folder) = (Domain::new(), tempfile::tempdir().unwrap());
-    let vanilla = checkpoint(&domain, folder.path(), "vanilla");
     let failed = |command| {
         let output = output(command);
         assert!(!output.status.success());
         String::from_utf8_lossy(&output.stderr).into_owned()
     };
-    let text = failed(evaluate(&domain, &vanilla, &[]));
-    assert!(text.contains("vanilla") && text.lines().count() == 1, "{text}");
+    let mut command = domain.command("rcwm-trainer");
+    command.args(["evaluate", "--task", "reach", "--engine", "trainer", "--bundle"]).arg(folder.path());
+    let text = failed(command);
+    assert!(text.contains("--checkpoint") && text.lines().count() == 1, "{text}");
     let rcwm = checkpoint(&domain, folder.path(), "rcwm");
     let text = failed(evaluate(&domain, &rcwm, &["--simulator", "/no/such/program"]));
     assert!(text.contains("/no/such/program") && text.lines().count() == 1, "{text}");
