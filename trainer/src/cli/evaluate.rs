@@ -40,9 +40,9 @@ With --data (paper, Fig. 4 and 7): every model sees some steps of the same traje
 imagines the rest with the recorded actions. The robot dynamics error is the squared error between
 imagined and true picture, both multiplied by the true robot mask, mean over the whole picture;
 the episodes need masks. With --task: the policy is exported and deployed by rcwm-runtime in
-rcwm-simulator, in lock-step; a vanilla model, which no runtime deploys, decides here. With --report: both, as one page that shows all that lies in the
-folder's parts; a part is measured again only if it is asked for from something else. Ctrl-C keeps
-what is done.")]
+rcwm-simulator, in lock-step; a vanilla model, which no runtime deploys, decides in this process.
+With --report: both, as one page that shows all that lies in the folder's parts; a part is measured
+again only if it is asked for from something else. Ctrl-C keeps what is done.")]
 #[command(group = clap::ArgGroup::new("on").required(true).multiple(true).args(["data", "tasks", "report"]))]
 pub struct Evaluate {
     /// Folder of a checkpoint (repeatable with --data: the later ones are compared with the first)
@@ -132,6 +132,10 @@ impl Evaluate {
     }
 
     fn report(&self, folder: &Path, stop: &AtomicBool) -> Result<()> {
+        ensure!(
+            self.engine != TRAINER_ENGINE,
+            "--engine trainer: a report deploys bundles, expected tract or ort"
+        );
         let device = super::parse_device(&self.device)?;
         let mut checkpoints: Vec<(String, Checkpoint)> = Vec::new();
         for (name, _, checkpoint) in self.models(&device)? {
@@ -326,7 +330,11 @@ impl Evaluate {
     /// Exports a checkpoint's policy into `folder`, if a runtime deploys its kind.
     fn deployed(&self, checkpoint: &Path, folder: &Path, stop: &AtomicBool) -> Result<Deployed> {
         let checkpoint = Checkpoint::read(checkpoint, &Device::Cpu)?;
-        if checkpoint.settings.model.kind == ModelKind::Vanilla || self.engine == TRAINER_ENGINE {
+        let vanilla = checkpoint.settings.model.kind == ModelKind::Vanilla;
+        if vanilla && self.engine != TRAINER_ENGINE {
+            eprintln!("evaluate: no runtime deploys a vanilla model; --engine trainer takes its place");
+        }
+        if vanilla || self.engine == TRAINER_ENGINE {
             return Ok(Deployed::Here(Box::new(checkpoint)));
         }
         let place = folder.join("bundle");

@@ -77,6 +77,16 @@ pub enum ClosedLoopError {
         /// Its number.
         number: u64,
     },
+    /// A policy that decides in this process gave a number that is not finite.
+    #[error(
+        "step {step} of episode {episode}: the policy's action is not finite, so nothing was scored; choose an earlier checkpoint"
+    )]
+    NotFinite {
+        /// The episode's number.
+        episode: u64,
+        /// The step.
+        step: u32,
+    },
     /// Acting in this process failed.
     #[error(transparent)]
     Acting(#[from] FleetError),

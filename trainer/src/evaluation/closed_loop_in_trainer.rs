@@ -46,6 +46,10 @@ pub fn closed_loop_in_trainer(
         let sights: Vec<_> = gathered.iter().map(|one| one.seen()).collect();
         let decisions = policy.decide(&sights, &mut sampler)?;
         for (one, decision) in gathered.iter().zip(decisions) {
+            if decision.refused {
+                let (episode, step) = (one.observation.episode, one.observation.step);
+                return Err(ClosedLoopError::NotFinite { episode, step });
+            }
             fleet.answer(one, decision.action)?;
             if let Some(recorded) = fleet.record(one)? {
                 served[recorded.simulator].add(&recorded.episode);
