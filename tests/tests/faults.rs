@@ -4,6 +4,7 @@ use std::time::Duration;
 
 use rcwm_tests::faults::{Bed, ControllerOptions, Experiment, Fault, Outcome, poisoned_bundle};
 use rcwm_tests::{Domain, Observer, Running, output, read_json, shipped_bundle};
+use rustix::process::Signal;
 
 /// Slow enough for a busy machine: these tests tell what is sent, `fault-table` tells when.
 const PERIOD: Duration = Duration::from_millis(50);
@@ -91,7 +92,7 @@ fn the_controller_goes_on_with_the_next_simulator() {
 #[test]
 fn a_second_controller_is_refused_and_the_first_goes_on() {
     let domain = Domain::new();
-    let _simulator = start_simulator(&domain, &[]);
+    let simulator = start_simulator(&domain, &[]);
     let mut first = Running::start(runtime(&domain));
     let observer = Observer::new(&domain, "fault");
     observer.wait_for(|observation| observation.sequence >= 3);
@@ -101,6 +102,12 @@ fn a_second_controller_is_refused_and_the_first_goes_on() {
     let seen = observer.wait_for(|_| true);
     observer.wait_for(|observation| observation.sequence > seen);
     assert!(first.is_running());
+    drop(observer);
+    for mut running in [first, simulator] {
+        running.signal(Signal::INT);
+        running.end();
+    }
+    assert_eq!(domain.leftovers(), Vec::<String>::new());
 }
 
 #[test]
