@@ -9,23 +9,23 @@ const CANDLE: &[&str] = &["candle-core", "candle-nn"];
 const TRACT: &[&str] = &["tract-core", "tract-onnx"];
 const PYTHON: &[&str] = &["pyo3", "pyo3-ffi"];
 
-fn normal_dependencies(package: &str) -> Vec<String> {
+/// What cargo would build for these packages, a line each in this format.
+fn tree(packages: &[&str], edges: &str, format: &str) -> Vec<String> {
     let mut command = Command::new(env!("CARGO"));
-    command.current_dir(root()).args([
-        "tree",
-        "--locked",
-        "--edges",
-        "normal,build",
-        "--prefix",
-        "none",
-        "--format",
-        "{p}",
-    ]);
-    command.args(["--package", package]);
+    command
+        .current_dir(root())
+        .args(["tree", "--locked", "--edges", edges, "--prefix", "none", "--format", format]);
+    packages.iter().for_each(|package| _ = command.args(["--package", package]));
     let output = output(command);
     assert!(output.status.success(), "{}", String::from_utf8_lossy(&output.stderr));
-    let text = String::from_utf8_lossy(&output.stdout).into_owned();
-    text.lines().filter_map(|line| line.split_whitespace().next()).map(str::to_owned).collect()
+    // A crate that was listed before is marked by a star.
+    let text = String::from_utf8_lossy(&output.stdout).replace(" (*)", "");
+    text.lines().filter(|line| !line.is_empty()).map(str::to_owned).collect()
+}
+
+fn normal_dependencies(package: &str) -> Vec<String> {
+    let lines = tree(&[package], "normal,build", "{p}");
+    lines.iter().filter_map(|line| line.split_whitespace().next()).map(str::to_owned).collect()
 }
 
 fn assert_without(package: &str, forbidden: &[&[&str]]) {
@@ -54,6 +54,22 @@ fn the_trainer_depends_on_neither_tract_nor_python() {
 #[test]
 fn the_simulator_depends_on_neither_candle_nor_tract() {
     assert_without("rcwm-simulator", &[CANDLE, TRACT]);
+}
+
+#[test]
+fn what_the_demo_compiles_is_not_compiled_again_for_learning() {
+    let demo = ["rcwm-simulator", "rcwm-runtime"];
+    let learning = [demo[0], demo[1], "rcwm-trainer"];
+    // What is linked, and all that is built, procedural macros included: a crate may be both, with other features.
+    for edges in ["normal,no-proc-macro", "normal,build"] {
+        let with_features = |packages: &[&str]| tree(packages, edges, "{p} with {f}");
+        let built = with_features(&learning);
+        let again: Vec<_> = with_features(&demo).into_iter().filter(|line| !built.contains(line)).collect();
+        assert!(
+            built.len() > 100 && again.is_empty(),
+            "built with other features beside the trainer: {again:?}"
+        );
+    }
 }
 
 #[test]

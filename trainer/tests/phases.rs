@@ -198,6 +198,15 @@ fn few_shot_learning_that_was_interrupted_in_any_stage_gives_the_same_weights() 
             "{kind:?}, {world_goes_on}, {imitates}: not the same bits"
         );
         assert_eq!(updates_logged(&parts), updates_logged(&whole));
+        let stored = |folder| bits(&Checkpoint::read(&Run::last(folder), &Device::Cpu).unwrap().parameters);
+        assert!(
+            stored(&parts) == stored(&whole),
+            "{kind:?}, {world_goes_on}, {imitates}: not the same average"
+        );
+        let averaged = changed(&stored(&whole), &expected);
+        let moves =
+            |name: &String| world_goes_on || !matches!(side_of(name), Side::Robot | Side::Environment);
+        assert!(!averaged.is_empty() && averaged.iter().all(moves), "{averaged:?}");
     }
 }
 
@@ -207,6 +216,8 @@ fn each_stage_moves_its_own_part_alone() {
     let source = pretrained(ModelKind::Rcwm);
     let mut settings = settings(ModelKind::Rcwm);
     settings.reset.keep_behaviour = true;
+    // Where there is an average, the actor's stage begins with it in the place of all weights.
+    settings.average_decay = 0.0;
     let mut learning = Fewshot::create(folder.path(), settings.clone(), &source, &Device::Cpu).unwrap();
     let mut before = bits(learning.parameters());
     for (until, stage) in [(4, Stage::Environment), (8, Stage::World), (20, Stage::Actor)] {

@@ -102,9 +102,26 @@ fn a_resumed_run_gives_the_same_weights_as_one_that_never_stopped() {
         let newest = |folder| lines(folder, true).last().unwrap()["held_out"].clone();
         assert_eq!(newest(&halves), newest(&whole), "the same weights are judged the same");
         assert_eq!((event_files(&whole), event_files(&halves)), (1, 2));
-        let stored = Checkpoint::read(&Run::last(&halves), &Device::Cpu).unwrap();
-        assert!(bits(&stored.parameters) == expected);
+        let stored = |folder| bits(&Checkpoint::read(&Run::last(folder), &Device::Cpu).unwrap().parameters);
+        assert!(stored(&halves) == stored(&whole), "{kind:?}: not the same average");
+        assert!(stored(&halves) == bits(&second.kept()) && stored(&halves) != expected);
     }
+}
+
+#[test]
+fn without_an_average_a_checkpoint_holds_the_weights() {
+    let folder = tempfile::tempdir().unwrap();
+    let settings = TrainingSettings { average_decay: 0.0, ..settings(ModelKind::Rcwm, 6) };
+    let mut training = Pretraining::create(folder.path(), settings, &Device::Cpu).unwrap();
+    train(&mut training);
+    let stored = Checkpoint::read(&Run::last(folder.path()), &Device::Cpu).unwrap();
+    assert!(bits(&stored.parameters) == bits(training.parameters()));
+    // Whoever wants an average from now on gets one that begins here.
+    let averaging = TrainingSettings { average_decay: 0.5, ..self::settings(ModelKind::Rcwm, 12) };
+    let mut training = Pretraining::resume(folder.path(), averaging, &Device::Cpu).unwrap();
+    train(&mut training);
+    let stored = Checkpoint::read(&Run::last(folder.path()), &Device::Cpu).unwrap();
+    assert!(bits(&stored.parameters) != bits(training.parameters()));
 }
 
 #[test]

@@ -10,7 +10,7 @@ use crate::learning::parts::part;
 use crate::learning::{Adam, Gradients, LearningError, Trained};
 use crate::model::agent::Agent;
 use crate::model::latent::{Sampler, State};
-use crate::model::parameters::Parameters;
+use crate::model::parameters::{Parameters, mix};
 use crate::ops;
 
 /// Actor, critic and its slow copy with what it takes to train them. The world model is only read: no gradient reaches it.
@@ -119,8 +119,7 @@ impl BehaviourLearner {
         for (name, slow) in self.parameters.iter() {
             let Some(name) = name.strip_prefix("slow_") else { continue };
             let Some(critic) = self.parameters.get(name) else { continue };
-            let mixed = ((critic.as_tensor() * share)? + (slow.as_tensor() * (1.0 - share))?)?;
-            slow.set(&mixed.detach())?;
+            mix(slow, critic, share)?;
         }
         Ok(())
     }

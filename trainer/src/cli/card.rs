@@ -103,6 +103,10 @@ impl Card {
                 processor_time(pretrained)
             );
         }
+        if settings.average_decay > 0.0 {
+            let decay = settings.average_decay;
+            card += &format!("| weights | running average over the updates, decay {decay} |\n");
+        }
         let seed = settings.seed;
         card += &format!("| seed | {seed} |\n\n");
         card += "Success counts where the task was solved at any step of the episode. Check and score it; BUNDLE is this folder:\n\n```sh\n\

@@ -141,6 +141,31 @@ impl Parameters {
         &self.device
     }
 
+    /// Parameters of their own with the same values.
+    ///
+    /// # Errors
+    /// [`ParameterError::Tensor`].
+    pub fn copied(&self) -> Result<Self, ParameterError> {
+        let copy = |(name, var): (&String, &Var)| {
+            Ok((name.clone(), Var::from_tensor(&var.as_detached_tensor().copy()?)?))
+        };
+        let vars = self.vars.iter().map(copy).collect::<Result<_, candle_core::Error>>()?;
+        Ok(Self { vars, device: self.device.clone() })
+    }
+
+    /// Moves the parameters whose names `moves` accepts towards those of the same name in `other`: by nothing at a `share` of 0, all
+    /// the way at 1.
+    ///
+    /// # Errors
+    /// [`ParameterError::Missing`] where `other` has none of a name, or [`ParameterError::Tensor`].
+    pub fn mix(&self, other: &Self, share: f64, moves: impl Fn(&str) -> bool) -> Result<(), ParameterError> {
+        for (name, var) in self.vars.iter().filter(|(name, _)| moves(name)) {
+            let missing = || ParameterError::Missing { name: name.clone(), shape: var.dims().to_vec() };
+            mix(var, other.get(name).ok_or_else(missing)?, share)?;
+        }
+        Ok(())
+    }
+
     /// A scope that gives the parameters themselves: gradients reach them.
     #[must_use]
     pub fn trainable(&self) -> Scope<'_> {
@@ -158,6 +183,15 @@ impl Parameters {
     pub fn trainable_where(&self, trains: fn(&str) -> bool) -> Scope<'_> {
         Scope { source: Source::Shared { parameters: self, trains }, prefix: String::new() }
     }
+}
+
+/// Moves `var` towards `goal` by this share of the way.
+///
+/// # Errors
+/// Those of candle.
+pub fn mix(var: &Var, goal: &Var, share: f64) -> candle_core::Result<()> {
+    let mixed = ((goal.as_detached_tensor() * share)? + (var.as_detached_tensor() * (1.0 - share))?)?;
+    var.set(&mixed)
 }
 
 /// Lists what a model asks for while it is built.

@@ -15,7 +15,7 @@ use super::{
 };
 use crate::checkpoint::Checkpoint;
 use crate::cloning::{CloningLearner, Examples, Views, cloning_loss, state_of_features};
-use crate::learning::{Imitation, Trained, WorldLearner};
+use crate::learning::{Imitation, Side, Trained, WorldLearner, side_of};
 use crate::model::agent::Agent;
 use crate::model::latent::Sampler;
 use crate::model::parameters::Parameters;
@@ -198,11 +198,12 @@ impl Fewshot {
         while self.state.updates < total && !stop.load(Ordering::Relaxed) {
             let (stage, number) = Stage::of(&self.settings.fewshot, self.state.updates);
             if work.stage != Some(stage) {
-                self.enter(stage, &mut work, &episodes)?;
+                self.enter(stage, number, &mut work, &episodes)?;
             }
             self.update(stage, number, &mut work, &mut interval)?;
             self.state.updates += 1;
             let updates = self.state.updates;
+            self.run.follow(&self.parameters, self.moved(stage), updates)?;
             let line = updates
                 .is_multiple_of(self.settings.metrics_every)
                 .then(|| interval.end(updates, stage.name()));
@@ -221,14 +222,29 @@ impl Fewshot {
         Ok(Outcome { updates: self.state.updates, interrupted: self.state.updates < total })
     }
 
-    /// Prepares what the stage needs.
+    /// Which parameters an update of the stage may move.
+    fn moved(&self, stage: Stage) -> fn(&str) -> bool {
+        match stage {
+            Stage::Actor if !self.settings.fewshot.world_goes_on => {
+                |name| matches!(side_of(name), Side::Actor | Side::Critic | Side::SlowCritic)
+            }
+            _ => |_| true,
+        }
+    }
+
+    /// Prepares what the stage needs from its update `number` on.
     fn enter(
         &mut self,
         stage: Stage,
+        number: u64,
         work: &mut Work,
         episodes: &[Arc<Episode>],
     ) -> Result<(), TrainingError> {
         work.stage = Some(stage);
+        if stage == Stage::Actor && number == 0 {
+            // The actor learns on the states that the deployed world model will give it.
+            self.parameters.mix(&self.run.kept(&self.parameters), 1.0, |_| true)?;
+        }
         let fewshot = &self.settings.fewshot;
         let imitation = Imitation {
             scale: fewshot.imitation_scale,
@@ -338,7 +354,7 @@ impl Fewshot {
         let [world_name, actor_name, critic_name] = OPTIMISERS;
         let optimisers = [(world_name, self.world.adam()), (actor_name, actor), (critic_name, critic)];
         self.run.save(&self.parameters, &self.settings, &self.state, &optimisers, Best::No)?;
-        let agent = Agent::new(&self.parameters.frozen(), &self.settings.model)?;
+        let agent = Agent::new(&self.run.kept(&self.parameters).frozen(), &self.settings.model)?;
         if !self.held_out.is_empty() {
             let cloning = self.held_out_cloning(&agent)?;
             self.run.log(&json!({"update": self.state.updates, "held_out": {"cloning": cloning}}))?;

@@ -7,7 +7,7 @@
 //! metrics.jsonl        one line for every `metrics_every` updates, one on the held-out episodes for every checkpoint: the truth
 //! events.out.tfevents  the same numbers for TensorBoard; a resumed run begins another file
 //! curves.png           the same numbers as curves, drawn anew with every checkpoint
-//! checkpoints/last/    weights, settings and the optimiser's state; the newest
+//! checkpoints/last/    weights (their running average where `average_decay` is above 0), settings and the state of training: the newest
 //! checkpoints/best/    the one with the lowest loss on the held-out episodes; where there are none, with the lowest mask-free loss
 //!                      over an interval between checkpoints
 //! films/               what the model imagines of one (held-out) episode a task: 000500-reach.png with every checkpoint, and animated
@@ -22,6 +22,7 @@
 //! | `settings` | what can be chosen, presets |
 //! | `state` | what a checkpoint holds beside the weights |
 //! | `run` | the folder: settings, metrics, checkpoints |
+//! | `weight_average` | what checkpoints hold of the weights |
 //! | `metrics` | what a line of metrics says |
 //! | `tensorboard` | event files |
 //! | `curves` | the metrics as a picture |
@@ -51,6 +52,7 @@ mod run;
 mod settings;
 mod state;
 mod tensorboard;
+mod weight_average;
 
 pub use averages::{Averages, Interval, Line, Spent};
 pub use demonstrations::demonstrations;

@@ -97,10 +97,16 @@ impl Pretraining {
         self.state.updates
     }
 
-    /// The parameters, as they are.
+    /// The parameters that are trained, as they are.
     #[must_use]
     pub fn parameters(&self) -> &Parameters {
         &self.parameters
+    }
+
+    /// What a checkpoint would hold of them: see [`Run::kept`].
+    #[must_use]
+    pub fn kept(&self) -> Parameters {
+        self.run.kept(&self.parameters)
     }
 
     /// Trains until the settings' number of updates is reached or `stop` is set; either way ends with a checkpoint.
@@ -124,6 +130,7 @@ impl Pretraining {
             let batch = batches.next_batch()?.into_tensors(&self.device)?;
             let update = self.learner.update(&batch, &mut Sampler::numbered(self.settings.seed, number))?;
             self.state.updates += 1;
+            self.run.follow(&self.parameters, Trained::World.filter(), self.state.updates)?;
             interval.means.add(&update);
             since_checkpoint.add(&update);
             let metrics = self.state.updates.is_multiple_of(self.settings.metrics_every).then(|| {
@@ -165,7 +172,7 @@ impl Pretraining {
 
     /// Saves a checkpoint, then judges it, draws the curves and makes films.
     fn save(&mut self, since: Means, judge: &Judge) -> Result<Option<HeldOutLosses>, TrainingError> {
-        let agent = Agent::new(&self.parameters.frozen(), &self.settings.model)?;
+        let agent = Agent::new(&self.run.kept(&self.parameters).frozen(), &self.settings.model)?;
         let (sizes, world) = (&self.settings.replay, &self.settings.world);
         let held_out = judge.held_out.losses(&agent, sizes, world, &self.device)?;
         let best = match &held_out {

@@ -10,9 +10,11 @@ use serde::{Deserialize, Serialize};
 
 use super::metrics::scalars;
 use super::tensorboard::EventFile;
+use super::weight_average::WeightAverage;
 use super::{Phase, TrainingError, TrainingSettings, TrainingState, curves};
 use crate::checkpoint::{self, Checkpoint, CheckpointSettings};
 use crate::learning::Adam;
+use crate::model::agent;
 use crate::model::parameters::Parameters;
 
 const SETTINGS_FILE: &str = "settings.toml";
@@ -28,6 +30,8 @@ pub struct Run {
     metrics: File,
     events: EventFile,
     cpu: CpuTime,
+    average_decay: f64,
+    average: Option<WeightAverage>,
 }
 
 /// Processor time of all threads that a run has taken.
@@ -69,7 +73,7 @@ pub(super) enum GoesOn {
     From {
         /// Its folder.
         run: Run,
-        /// The weights.
+        /// The weights that are trained.
         parameters: Parameters,
         /// The counters.
         state: TrainingState,
@@ -131,6 +135,15 @@ impl Run {
         }
         let mut run = Self::resume(folder, settings, state.updates)?;
         run.cpu.earlier = stored.cpu_seconds;
+        let trained = TrainingState::trained(&agent::specs(&stored.model)?, &moments, device)?;
+        let parameters = match trained {
+            Some(trained) => {
+                run.average = (settings.average_decay > 0.0)
+                    .then(|| WeightAverage::of(parameters, settings.average_decay));
+                trained
+            }
+            None => parameters,
+        };
         Ok(GoesOn::From { run, parameters, state, moments })
     }
 
@@ -166,7 +179,14 @@ impl Run {
         let path = folder.join(METRICS_FILE);
         let metrics = OpenOptions::new().append(true).open(&path).map_err(failed(&path))?;
         let events = EventFile::begin(folder, first_update).map_err(failed(folder))?;
-        Ok(Self { folder: folder.to_path_buf(), metrics, events, cpu: CpuTime::since_now(0.0) })
+        Ok(Self {
+            folder: folder.to_path_buf(),
+            metrics,
+            events,
+            cpu: CpuTime::since_now(0.0),
+            average_decay: settings.average_decay,
+            average: None,
+        })
     }
 
     /// The settings of the run in `folder`.
@@ -213,6 +233,35 @@ impl Run {
         curves::write(&self.folder.join(METRICS_FILE), &self.folder.join(CURVES_FILE), warm_up_updates)
     }
 
+    /// Lets the average follow the weights, where one is kept, after update number `updates`, from 1. `trained` accepts the names of what
+    /// may have moved.
+    ///
+    /// # Errors
+    /// Those of candle.
+    pub(super) fn follow(
+        &mut self,
+        parameters: &Parameters,
+        trained: impl Fn(&str) -> bool,
+        updates: u64,
+    ) -> Result<(), TrainingError> {
+        if self.average_decay == 0.0 {
+            return Ok(());
+        }
+        match &mut self.average {
+            Some(average) => Ok(average.follow(parameters, trained, updates)?),
+            None => {
+                self.average = Some(WeightAverage::of(parameters.copied()?, self.average_decay));
+                Ok(())
+            }
+        }
+    }
+
+    /// What a checkpoint holds when `parameters` are trained: their average, where one is kept.
+    #[must_use]
+    pub fn kept(&self, parameters: &Parameters) -> Parameters {
+        self.average.as_ref().map_or(parameters, WeightAverage::weights).clone()
+    }
+
     /// Where films go; the folder is made.
     ///
     /// # Errors
@@ -223,7 +272,7 @@ impl Run {
         Ok(films)
     }
 
-    /// Saves a checkpoint as the newest one, and as the best if it is. The state is written before the weights that it goes with,
+    /// Saves a checkpoint as the newest one, and as the best if it is: the weights, or their average where one is kept. The state is written before the weights that it goes with,
     /// and older states are removed after, so that the folder always holds a whole pair.
     ///
     /// # Errors
@@ -247,7 +296,7 @@ impl Run {
                 weights_sha256: String::new(),
                 model: settings.model.clone(),
             },
-            parameters: parameters.clone(),
+            parameters: self.kept(parameters),
         };
         if best == Best::Yes {
             checkpoint.write(&self.folder.join("checkpoints").join("best"))?;
@@ -255,7 +304,8 @@ impl Run {
         let last = Self::last(&self.folder);
         fs::create_dir_all(&last).map_err(failed(&last))?;
         let weights_sha256 = checkpoint.weights_sha256()?;
-        state.write(optimisers, &last, &weights_sha256)?;
+        let trained = self.average.is_some().then_some(parameters);
+        state.write(optimisers, trained, &last, &weights_sha256)?;
         checkpoint.write(&last)?;
         Ok(TrainingState::remove_others(&last, &weights_sha256)?)
     }

@@ -35,6 +35,10 @@ pub struct TrainingSettings {
     /// Updates between two checkpoints.
     #[serde(default = "checkpoint_every")]
     pub checkpoint_every: u64,
+    /// What the running average of the weights keeps of itself with every update: checkpoints hold the average, which small batches
+    /// shake less than the weights. 0 averages nothing, as the authors.
+    #[serde(default)]
+    pub average_decay: f64,
     /// Sizes of the model.
     pub model: ModelSettings,
     /// Learning of the world model.
@@ -137,18 +141,20 @@ impl TrainingSettings {
     #[must_use]
     pub fn preset(preset: Preset, kind: ModelKind, data: PathBuf) -> Self {
         let paper = ReplaySettings::default();
-        let (name, replay, pretrain) = match preset {
+        let (name, average_decay, replay, pretrain) = match preset {
             Preset::Debug => (
                 "debug",
+                0.5,
                 ReplaySettings { batch: 2, length: 6, ..paper },
                 PretrainSettings { warm_up_updates: 10, updates: 40 },
             ),
             Preset::Small => (
                 "small",
+                0.998,
                 ReplaySettings { batch: 8, length: 32, ..paper },
                 PretrainSettings { warm_up_updates: 500, updates: 20_000 },
             ),
-            Preset::Paper => ("paper", paper, PretrainSettings::default()),
+            Preset::Paper => ("paper", 0.0, paper, PretrainSettings::default()),
         };
         Self {
             phase: Phase::Pretrain,
@@ -160,6 +166,7 @@ impl TrainingSettings {
             masks: PathBuf::new(),
             metrics_every: metrics_every(),
             checkpoint_every: checkpoint_every(),
+            average_decay,
             model: ModelSettings::preset(preset, kind),
             world: world_settings(preset),
             behaviour: BehaviourSettings::default(),
@@ -208,6 +215,12 @@ impl TrainingSettings {
             return Err(SettingsError::Invalid(format!(
                 "world.paint_every = {}, expected 1 to replay.length = {}",
                 self.world.paint_every, replay.length
+            )));
+        }
+        if !(0.0..1.0).contains(&self.average_decay) {
+            let found = self.average_decay;
+            return Err(SettingsError::Invalid(format!(
+                "average_decay = {found}, expected 0 <= average_decay < 1"
             )));
         }
         for (name, every) in

@@ -10,12 +10,14 @@ use serde::{Deserialize, Serialize};
 
 use crate::behaviour::ReturnRange;
 use crate::learning::{Adam, AdamSettings, Moments};
-use crate::model::parameters::Parameters;
+use crate::model::parameters::{ParameterError, ParameterSpec, Parameters};
 
 /// Key of [`TrainingState`] in the file's metadata.
 const METADATA_KEY: &str = "training";
-/// Largest file accepted, in bytes: twice the largest file of weights.
-const STATE_BYTES_MAX: u64 = 8 << 30;
+/// Under what the weights that are trained lie.
+const TRAINED: &str = "trained";
+/// Largest file accepted, in bytes: three times the largest file of weights.
+const STATE_BYTES_MAX: u64 = 12 << 30;
 
 /// Why the state of training could not be written or was refused.
 #[derive(Debug, thiserror::Error)]
@@ -50,6 +52,9 @@ pub enum StateError {
         /// Its shape.
         found: Vec<usize>,
     },
+    /// The weights that are trained do not fit the model.
+    #[error("training state: {0}")]
+    Parameters(#[from] ParameterError),
     /// A tensor operation failed.
     #[error("training state: {0}")]
     Tensor(#[from] candle_core::Error),
@@ -89,13 +94,15 @@ fn file_of(folder: &Path, weights_sha256: &str) -> PathBuf {
 }
 
 impl TrainingState {
-    /// Writes the state with the moments of `optimisers`, by name, beside the weights of this checksum.
+    /// Writes the state with the moments of `optimisers`, by name, beside the weights of this checksum, and the weights that are trained
+    /// where the checkpoint holds their average.
     ///
     /// # Errors
     /// See [`StateError`].
     pub fn write(
         &self,
         optimisers: &[(&str, &Adam)],
+        trained: Option<&Parameters>,
         folder: &Path,
         weights_sha256: &str,
     ) -> Result<(), StateError> {
@@ -108,6 +115,9 @@ impl TrainingState {
                 arrays.insert(format!("{key}/second"), bytes(&moments.second)?);
                 state.optimiser_steps.insert(key, moments.steps);
             }
+        }
+        for (name, var) in trained.into_iter().flat_map(Parameters::iter) {
+            arrays.insert(format!("{TRAINED}/{name}"), bytes(var)?);
         }
         let views = arrays
             .iter()
@@ -148,6 +158,29 @@ impl TrainingState {
         let text = header.metadata().as_ref().and_then(|metadata| metadata.get(METADATA_KEY));
         let state = serde_json::from_str(text.map_or("", String::as_str))?;
         Ok((state, Tensors::from_bytes(&file)?))
+    }
+
+    /// The weights that are trained, of these names and shapes, where the checkpoint holds their average.
+    ///
+    /// # Errors
+    /// [`StateError::Parameters`] if they do not fit, or those of [`Tensors`].
+    pub fn trained(
+        specs: &[ParameterSpec],
+        tensors: &Tensors,
+        device: &Device,
+    ) -> Result<Option<Parameters>, StateError> {
+        let mut found = BTreeMap::new();
+        for ParameterSpec { name, .. } in specs {
+            let key = format!("{TRAINED}/{name}");
+            if let Ok(array) = tensors.f32(&key) {
+                let tensor = Tensor::from_iter(array.iter().copied(), device)?.reshape(array.shape())?;
+                found.insert(name.clone(), tensor);
+            }
+        }
+        if found.is_empty() {
+            return Ok(None);
+        }
+        Ok(Some(Parameters::from_tensors(specs, found, device)?))
     }
 
     /// The optimiser of this name as it was.
