@@ -13,6 +13,8 @@ pub struct Case {
     /// How.
     #[serde(flatten)]
     pub settings: EngineSettings,
+    /// Whether it gets ready before an image is expected, as a controller does.
+    pub rehearses: bool,
 }
 
 /// ONNX Runtime as the yardstick: the five exported parts one after another, one thread.
@@ -23,7 +25,7 @@ pub(super) const SINGLE: EngineSettings = EngineSettings::single_threaded(Engine
 /// The engines as they are deployed: tract on one and on two threads, ONNX Runtime on one and on two.
 #[must_use]
 pub fn engines(kinds: &[EngineKind]) -> Vec<Case> {
-    let case = |name, settings| Case { name, settings };
+    let case = |name, settings| Case { name, settings, rehearses: true };
     let mut cases = Vec::new();
     for kind in kinds {
         match kind {
@@ -50,20 +52,24 @@ pub fn ladder() -> Vec<Case> {
     let convolutions = Optimizations { convolutions: true, ..norms };
     let layers = Optimizations { layers: true, ..convolutions };
     let half = Optimizations { half_weights: true, ..layers };
-    let compiled =
-        |name, optimizations| Case { name, settings: SINGLE.with_form(Form::Compiled(optimizations)) };
+    let compiled = |name, optimizations, rehearses| Case {
+        name,
+        settings: SINGLE.with_form(Form::Compiled(optimizations)),
+        rehearses,
+    };
     let mut cases = vec![
-        Case { name: "exported parts", settings: SINGLE.with_form(Form::Exported) },
-        compiled("cut, worked ahead", none),
-        compiled("+ norms fused", norms),
-        compiled("+ convolutions", convolutions),
-        compiled("+ layers", layers),
-        compiled("+ f16 weights", half),
+        Case { name: "exported parts", settings: SINGLE.with_form(Form::Exported), rehearses: false },
+        compiled("cut, worked ahead", none, false),
+        compiled("+ norms fused", norms, false),
+        compiled("+ convolutions", convolutions, false),
+        compiled("+ layers", layers, false),
+        compiled("+ rehearsed", layers, true),
+        compiled("+ f16 weights", half, true),
     ];
     if EngineSettings::tract().threads > 1 {
         let two = |name, optimizations| {
             let settings = EngineSettings::tract().with_form(Form::Compiled(optimizations));
-            Case { name, settings }
+            Case { name, settings, rehearses: true }
         };
         cases.extend([two("2 threads", layers), two("2 threads, f16 weights", half)]);
     }

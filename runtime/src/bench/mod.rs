@@ -170,13 +170,20 @@ fn late_cost(bundle: &Bundle) -> Result<Cost, BenchError> {
 }
 
 impl Runner {
-    /// Ahead first, as a controller does after it has sent an action; then the image, as if it came now.
+    /// Ahead first, as a controller does after it has sent an action, then ready for the image, as it does before one is expected; then the
+    /// image, as if it came now.
     fn tick(&mut self, image: &[u8], is_first: bool, measured: bool) -> Result<(), PolicyError> {
         let executed = self.executed.filter(|_| !is_first);
         let start = Instant::now();
         self.policy.work_ahead(executed.as_ref())?;
         let ahead_ns = start.elapsed().as_nanos() as u64;
-        self.policy.expect_image();
+        let start = Instant::now();
+        if self.case.rehearses {
+            self.policy.expect_image()
+        } else {
+            self.policy.wake()
+        }
+        let ready_ns = start.elapsed().as_nanos() as u64;
         let start = Instant::now();
         let decision = self.policy.observe(image, executed.as_ref())?;
         let tick_ns = start.elapsed().as_nanos() as u64;
@@ -184,6 +191,7 @@ impl Runner {
         if measured {
             self.telemetry.record(Stage::Tick, tick_ns);
             self.telemetry.record(Stage::Ahead, ahead_ns);
+            self.telemetry.record(Stage::Ready, ready_ns);
             self.telemetry.record_policy(&decision.stage_ns);
         }
         Ok(())

@@ -55,6 +55,9 @@ pub(super) struct TimeArguments {
     /// How long a wait polls before and after an observation is expected (lock-step: before it blocks), in microseconds
     #[arg(long, value_name = "US", default_value_t = 50)]
     spin_us: u64,
+    /// Does without computing the last tick once more before an observation is expected: spares processor time, and finds cold caches
+    #[arg(long)]
+    no_rehearsal: bool,
     /// Asks for SCHED_FIFO and locked memory, and says what was granted; `require` ends the run where something is refused
     #[arg(long, value_name = "try|require", num_args = 0..=1, require_equals = true, default_missing_value = "try")]
     realtime: Option<Realtime>,
@@ -92,7 +95,12 @@ impl SafetyArguments {
         let spin = Duration::from_micros(time.spin_us);
         ControllerSettings {
             silence_max: (self.silence_max > 0.0).then(|| Duration::from_secs_f64(self.silence_max)),
-            pacing: PacingSettings { spin, grace_periods: self.grace, stale_periods: self.stale_after },
+            pacing: PacingSettings {
+                spin,
+                gets_ready: !time.no_rehearsal,
+                grace_periods: self.grace,
+                stale_periods: self.stale_after,
+            },
             ticks: TickLimits {
                 imagined_ticks_max: self.imagined_ticks_max,
                 fallback_ticks_max: self.fallback_ticks_max,

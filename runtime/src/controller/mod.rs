@@ -38,7 +38,7 @@ use rcwm_models::wire::{Action, ControllerLink, LinkSettings, ObservationSample,
 use crate::pacing::{Pacing, PacingSettings, Plan};
 use crate::policy::{self, Policy};
 use crate::swap::{Moment, Swapper};
-use crate::telemetry::Telemetry;
+use crate::telemetry::{Stage, Telemetry};
 use surprise::SurpriseTelemetry;
 
 /// Longest wait before signals are looked at.
@@ -242,10 +242,17 @@ impl Controller {
         if let Some(sample) = self.newer.take() {
             return Ok(Brought::Observation(sample));
         }
-        let wait = match self.pacing.plan(monotonic_ns()) {
+        let mut plan = self.pacing.plan(monotonic_ns());
+        if plan == Plan::GetReady {
+            self.get_ready();
+            plan = self.pacing.plan(monotonic_ns());
+        }
+        let wait = match plan {
             // What has come while the time ran out wins, but is looked at once: observations of no use, however many, do not keep
             // an overdue tick from its turn.
             Plan::Overdue if self.looked => Ok(Wait::TimedOut),
+            // Not twice in a row; who comes back with nothing asks again.
+            Plan::GetReady => Ok(Wait::TimedOut),
             Plan::Overdue => {
                 self.looked = true;
                 Ok(self.link.poll_observation()?.map_or(Wait::TimedOut, Wait::Message))
@@ -253,7 +260,7 @@ impl Controller {
             Plan::Wait { spin, timeout } => {
                 self.looked = false;
                 if spin > Duration::ZERO {
-                    self.policy.expect_image();
+                    self.policy.wake();
                 }
                 self.link.wait_observation_polling(spin, timeout.min(WAIT_SLICE))
             }
@@ -267,6 +274,15 @@ impl Controller {
             Err(_) if stop.load(Ordering::Relaxed) => Ok(Brought::Nothing),
             Err(error) => Err(error.into()),
         }
+    }
+
+    /// Prepares the policy for an observation that will come soon.
+    fn get_ready(&mut self) {
+        let start = Instant::now();
+        self.policy.expect_image();
+        let took = start.elapsed();
+        self.pacing.got_ready(took);
+        self.telemetry.record(Stage::Ready, took.as_nanos() as u64);
     }
 
     /// The peer has said that it leaves.

@@ -9,10 +9,11 @@
 //!  scheduled   published            scheduled+P   expected        overdue
 //! -----|-----------|---------------------|------------|---------------|------->
 //!      |<-- lag -->|<-------------- P -------------->|<--- grace --->|
-//!                             blocks            | spins |   blocks
+//!                    blocks      | gets ready | spins |   blocks
 //! ```
 //!
-//! Waiting blocks until shortly before the expected time, polls from there to shortly after it, and blocks again. Where ticks
+//! Waiting blocks until shortly before the expected time, gets ready for what will come, polls from there to shortly after the expected
+//! time, and blocks again. How long getting ready takes is learnt from how long it took. Where ticks
 //! were slept through, only the newest is made up for: the others are counted, never run in a burst. In lock-step nothing is due.
 
 use std::time::Duration;
@@ -21,6 +22,8 @@ use rcwm_models::wire::{Observation, ObservationFlags};
 
 /// Shortest period that is believed, in ns: one that a peer has garbled must not make the loop run wild.
 const PERIOD_NS_MIN: u64 = 50_000;
+/// Getting ready begins at most this share of a period before polling, whatever it takes.
+const LEAD_SHARE: u64 = 4;
 /// A wait for which nothing is due.
 const NOTHING_DUE: Duration = Duration::from_secs(3600);
 
@@ -29,6 +32,8 @@ const NOTHING_DUE: Duration = Duration::from_secs(3600);
 pub struct PacingSettings {
     /// Polls so long before and after the expected time; in lock-step so long from the start of a wait.
     pub spin: Duration,
+    /// Whether to get ready for an observation before it is expected.
+    pub gets_ready: bool,
     /// An observation is overdue so many periods after it was expected.
     pub grace_periods: f64,
     /// An observation is stale when it was scheduled more than so many periods ago as it arrives.
@@ -37,7 +42,7 @@ pub struct PacingSettings {
 
 impl Default for PacingSettings {
     fn default() -> Self {
-        Self { spin: Duration::from_micros(50), grace_periods: 0.5, stale_periods: 2.0 }
+        Self { spin: Duration::from_micros(50), gets_ready: true, grace_periods: 0.5, stale_periods: 2.0 }
     }
 }
 
@@ -51,6 +56,8 @@ pub enum Plan {
         /// The longest wait, polling included.
         timeout: Duration,
     },
+    /// An observation will come soon: get ready for it, say [`Pacing::got_ready`], then ask again.
+    GetReady,
     /// An observation is missing: see [`Pacing::take_overdue`].
     Overdue,
 }
@@ -71,6 +78,8 @@ pub struct Missing {
 pub struct Pacing {
     settings: PacingSettings,
     schedule: Option<Schedule>,
+    /// How long before polling to get ready.
+    lead_ns: u64,
 }
 
 #[derive(Debug, Clone, Copy)]
@@ -83,6 +92,8 @@ struct Schedule {
     grace_ns: u64,
     /// Ticks after `sequence` that were found overdue.
     overdue: u64,
+    /// The tick after `sequence` that was got ready for; 0 for none.
+    ready: u64,
 }
 
 impl Schedule {
@@ -96,7 +107,7 @@ impl Pacing {
     /// Nothing is due yet.
     #[must_use]
     pub fn new(settings: PacingSettings) -> Self {
-        Self { settings, schedule: None }
+        Self { settings, schedule: None, lead_ns: 0 }
     }
 
     /// Takes the schedule over from an observation. After the last of an episode nothing is due: a reset takes its time.
@@ -113,7 +124,18 @@ impl Pacing {
             period_ns,
             grace_ns: share(period_ns, self.settings.grace_periods),
             overdue: 0,
+            ready: 0,
         });
+    }
+
+    /// Says that what [`Plan::GetReady`] asked for is done, and how long it took. The next time it begins so long before polling, and a
+    /// little more; a longer time is forgotten slowly.
+    pub fn got_ready(&mut self, took: Duration) {
+        let took_ns = u64::try_from(took.as_nanos()).unwrap_or(u64::MAX);
+        self.lead_ns = (self.lead_ns - self.lead_ns / 64).max(took_ns.saturating_add(took_ns / 4));
+        if let Some(schedule) = &mut self.schedule {
+            schedule.ready = schedule.overdue + 1;
+        }
     }
 
     /// Nothing is due any more.
@@ -144,7 +166,16 @@ impl Pacing {
         let until = |time_ns: u64| Duration::from_nanos(time_ns - now_ns);
         let (spin_from_ns, spin_until_ns) =
             (expected_ns.saturating_sub(spin_ns), expected_ns.saturating_add(spin_ns));
-        if now_ns < spin_from_ns {
+        let lead_ns = self.lead_ns.min(schedule.period_ns / LEAD_SHARE);
+        let ready_from_ns = spin_from_ns.saturating_sub(lead_ns);
+        // Once it is expected, what comes is not to wait for this.
+        let is_ready =
+            !self.settings.gets_ready || schedule.ready > schedule.overdue || now_ns >= expected_ns;
+        if now_ns < ready_from_ns {
+            Plan::Wait { spin: Duration::ZERO, timeout: until(ready_from_ns) }
+        } else if !is_ready {
+            Plan::GetReady
+        } else if now_ns < spin_from_ns {
             Plan::Wait { spin: Duration::ZERO, timeout: until(spin_from_ns) }
         } else if now_ns < spin_until_ns {
             Plan::Wait { spin: until(spin_until_ns), timeout: until(spin_until_ns) }
@@ -207,10 +238,51 @@ mod tests {
         let pacing = after(&observation());
         let expected_ns = PUBLISHED_NS + PERIOD_NS;
         assert_eq!(pacing.plan(PUBLISHED_NS), wait(0, 900_000));
+        assert_eq!(pacing.plan(expected_ns - 100_000), Plan::GetReady);
+        assert_eq!(pacing.plan(expected_ns), wait(100_000, 100_000), "too late to get ready");
+        let pacing = ready(pacing, 0);
         assert_eq!(pacing.plan(expected_ns - 100_000), wait(200_000, 200_000));
         assert_eq!(pacing.plan(expected_ns + 99_999), wait(1, 1));
         assert_eq!(pacing.plan(expected_ns + 100_000), wait(0, 400_000));
         assert_eq!(pacing.plan(expected_ns + 500_000), Plan::Overdue);
+    }
+
+    fn ready(mut pacing: Pacing, took_ns: u64) -> Pacing {
+        pacing.got_ready(Duration::from_nanos(took_ns));
+        pacing
+    }
+
+    #[test]
+    fn it_gets_ready_once_a_tick_as_long_before_as_that_takes() {
+        let mut pacing = ready(after(&observation()), 80_000);
+        let polls_ns = PUBLISHED_NS + PERIOD_NS - 100_000;
+        assert_eq!(pacing.plan(polls_ns - 100_000), wait(0, 100_000), "ready for this one already");
+        pacing.observed(&observation());
+        assert_eq!(pacing.plan(polls_ns - 100_001), wait(0, 1), "a quarter more than it took");
+        assert_eq!(pacing.plan(polls_ns - 100_000), Plan::GetReady);
+        let mut pacing = ready(pacing, 80_000);
+        assert!(pacing.take_overdue(PUBLISHED_NS + PERIOD_NS * 3 / 2).is_some());
+        assert_eq!(pacing.plan(polls_ns + PERIOD_NS - 1), Plan::GetReady, "the one that was missing is over");
+    }
+
+    #[test]
+    fn it_does_not_get_ready_where_that_is_not_wanted() {
+        let mut pacing = Pacing::new(PacingSettings { gets_ready: false, ..settings() });
+        pacing.observed(&observation());
+        assert_eq!(pacing.plan(PUBLISHED_NS + PERIOD_NS - 100_000), wait(200_000, 200_000));
+    }
+
+    #[test]
+    fn getting_ready_never_takes_more_than_a_quarter_of_the_period_ahead_and_is_forgotten_in_time() {
+        let mut pacing = ready(after(&observation()), 50 * PERIOD_NS);
+        let polls_ns = PUBLISHED_NS + PERIOD_NS - 100_000;
+        pacing.observed(&observation());
+        assert_eq!(pacing.plan(polls_ns - PERIOD_NS / 4 - 1), wait(0, 1));
+        for _ in 0..600 {
+            pacing.got_ready(Duration::from_nanos(80_000));
+        }
+        pacing.observed(&observation());
+        assert_eq!(pacing.plan(polls_ns - 100_001), wait(0, 1));
     }
 
     #[test]

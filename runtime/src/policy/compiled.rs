@@ -221,6 +221,13 @@ impl Tick for Compiled {
         self.act(work)
     }
 
+    fn rehearse(&mut self) {
+        // The last image in place of the next. What comes out, an error included, is overwritten by whatever comes next.
+        let _ = self.encoder.run(&mut self.values);
+        let _ = self.run_branches(&mut StageClock::start());
+        let _ = self.actor.run(&mut self.values);
+    }
+
     fn wake(&self) {
         if let Some(team) = &self.team {
             team.lock().unwrap_or_else(std::sync::PoisonError::into_inner).wake();

@@ -236,8 +236,15 @@ impl Policy {
         self.prepare(before, &mut StageClock::start()).map(drop)
     }
 
-    /// Says that an image is about to come: a second thread, where there is one, gets ready.
-    pub fn expect_image(&self) {
+    /// Gets ready for an image that will come soon: since the last one others have used the caches, so what stands between image and
+    /// action is computed once more from the last image, and dropped. Takes as long as a tick; results do not depend on it.
+    pub fn expect_image(&mut self) {
+        self.tick.wake();
+        self.tick.rehearse();
+    }
+
+    /// Says that an image may come at any moment: a second thread, where there is one, looks for work from now on, for a short while.
+    pub fn wake(&self) {
         self.tick.wake();
     }
 

@@ -29,8 +29,12 @@ pub(super) trait Tick: Send {
     /// All else without an image: the prior stands in for the posterior.
     fn imagine(&mut self, work: &mut Work<'_>) -> Result<(), PolicyError>;
 
-    /// An image is about to come.
+    /// An image may come at any moment: a second thread is to look for work.
     fn wake(&self) {}
+
+    /// An image will come soon: what [`Self::observe`] does is done once with what is there, for the sake of the caches. Changes nothing that
+    /// is read later.
+    fn rehearse(&mut self) {}
 }
 
 pub(super) fn load(bundle: &Bundle, settings: EngineSettings) -> Result<Box<dyn Tick>, PolicyError> {

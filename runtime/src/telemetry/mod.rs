@@ -58,11 +58,13 @@ pub enum Stage {
     Imagine,
     /// Work ahead, in the idle time after an action was sent.
     Ahead,
+    /// Getting ready, shortly before an observation is expected.
+    Ready,
 }
 
 impl Stage {
     /// All stages, in the order of a tick.
-    pub const ALL: [Self; 12] = [
+    pub const ALL: [Self; 13] = [
         Self::PublishLag,
         Self::Receive,
         Self::Encoder,
@@ -75,6 +77,7 @@ impl Stage {
         Self::FromSchedule,
         Self::Imagine,
         Self::Ahead,
+        Self::Ready,
     ];
 
     /// The stages of the policy, in the order of [`STAGES`].
@@ -97,6 +100,7 @@ impl Stage {
             Self::FromSchedule => "from_schedule",
             Self::Imagine => "imagine",
             Self::Ahead => "ahead",
+            Self::Ready => "ready",
         }
     }
 }

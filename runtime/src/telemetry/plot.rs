@@ -40,6 +40,7 @@ const COLOURS: [RGBColor; Stage::ALL.len()] = [
     RGBColor(106, 61, 154),
     RGBColor(136, 34, 60),
     RGBColor(0, 84, 72),
+    RGBColor(150, 110, 70),
 ];
 
 /// Why latencies could not be written.
