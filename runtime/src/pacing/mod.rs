@@ -335,7 +335,7 @@ mod tests {
     fn absurd_periods_neither_overflow_nor_run_wild() {
         let mut seen = observation();
         seen.period_ns = u64::MAX;
-        assert!(matches!(after(&seen).plan(u64::MAX - 1), Plan::Wait { .. }));
+        assert_ne!(after(&seen).plan(u64::MAX - 1), Plan::Overdue);
         seen.period_ns = 1;
         let mut pacing = after(&seen);
         let mut ticks = 0;

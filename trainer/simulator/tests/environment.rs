@@ -152,6 +152,23 @@ fn the_mask_is_empty_unless_asked_for() {
 }
 
 #[test]
+fn the_expert_for_reach_arrives_where_three_centimetres_off_are_still_there() {
+    let environment = Environment::open(EnvironmentSettings { masks: false, ..settings("reach") }).unwrap();
+    for episode in 0..3 {
+        environment.reset(episode).unwrap();
+        let mut script = Script::new(Policy::Expert, 0, episode);
+        for _ in 0..60 {
+            environment.step(script.decide(&environment).unwrap().unwrap()).unwrap();
+        }
+        // A whole action is a centimetre, twice a decision; then the arm comes to rest.
+        for sideways in [1.0, 0.5, 0.0, 0.0, 0.0] {
+            environment.step([sideways, 0.0, 0.0, 0.0]).unwrap();
+        }
+        assert!(see(&environment).1, "episode {episode}: the fingers are more than 5 cm from the goal");
+    }
+}
+
+#[test]
 fn the_expert_solves_the_task_and_proprioception_stays_in_range() {
     let environment =
         Environment::open(EnvironmentSettings { masks: false, ..settings("button-press") }).unwrap();
