@@ -53,7 +53,7 @@ mod tests {
         let mut average = WeightAverage::of(raw.copied().unwrap(), 0.9);
         let mut expected = 0.0;
         for update in 1..=400u32 {
-            let value = if update % 2 == 0 { 3.0 } else { 1.0 };
+            let value: f32 = if update % 2 == 0 { 3.0 } else { 1.0 };
             for (_, var) in raw.iter() {
                 var.set(&Tensor::new(&[value], &Device::Cpu).unwrap()).unwrap();
             }
