@@ -300,7 +300,6 @@ impl Finetuning {
             let phase = self.update(learning)?;
             self.state.updates += 1;
             let updates = self.state.updates;
-            self.run.follow(&self.parameters, |_| true, updates)?;
             let mut line = updates
                 .is_multiple_of(self.settings.metrics_every)
                 .then(|| learning.interval.end(updates, phase));
@@ -382,7 +381,7 @@ impl Finetuning {
         let optimisers = [(world_name, self.world.adam()), (actor_name, actor), (critic_name, critic)];
         self.run.save(&self.parameters, &self.settings, &self.state, &optimisers, is_best.into())?;
         self.run.draw_curves(self.settings.finetune.warm_up_updates)?;
-        let agent = Agent::new(&self.run.kept(&self.parameters).frozen(), &self.settings.model)?;
+        let agent = Agent::new(&self.parameters.frozen(), &self.settings.model)?;
         let (film, update) = (&self.settings.film, self.state.updates);
         write_films(&self.run, &agent, &self.scenes, film, update, &self.device)
     }

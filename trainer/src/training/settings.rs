@@ -36,7 +36,8 @@ pub struct TrainingSettings {
     #[serde(default = "checkpoint_every")]
     pub checkpoint_every: u64,
     /// What the running average of the weights keeps of itself with every update: checkpoints hold the average, which small batches
-    /// shake less than the weights. 0 averages nothing, as the authors.
+    /// shake less than the weights. 0 averages nothing, as the
+    /// authors; runs that act keep the weights that acted, whatever this is.
     #[serde(default)]
     pub average_decay: f64,
     /// Sizes of the model.
