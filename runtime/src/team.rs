@@ -3,9 +3,11 @@
 //! The calling thread publishes a piece of work as numbered chunks and begins to claim them; the helper, where it is awake, claims from the
 //! other end of the same counter. A chunk is run by whoever claimed it, so that a helper that sleeps or was preempted before it claimed
 //! anything costs nothing: the caller does all of it. Between ticks the helper spins for a while, then sleeps.
+//!
+//! An errand is what only the helper does, on what belongs to it: its caller need not wait for it.
 
-use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, AtomicU64, AtomicUsize, Ordering};
+use std::sync::{Arc, OnceLock};
 use std::thread::{JoinHandle, Thread};
 use std::time::{Duration, Instant};
 
@@ -19,6 +21,7 @@ const BITS: u32 = 16;
 const SPINS: u32 = 64;
 
 type Work<'a> = &'a (dyn Fn(usize) + Sync);
+type Errand = Box<dyn Fn() + Send + Sync>;
 
 /// What both threads share.
 #[derive(Default)]
@@ -29,6 +32,8 @@ struct Shared {
     work: [AtomicUsize; 2],
     done: AtomicUsize,
     panicked: AtomicBool,
+    errand: OnceLock<Errand>,
+    errand_wanted: AtomicBool,
     asleep: AtomicBool,
     ends: AtomicBool,
 }
@@ -69,6 +74,11 @@ impl Shared {
                 idle_since = Instant::now();
                 continue;
             }
+            if self.take_errand() {
+                self.run_errand();
+                idle_since = Instant::now();
+                continue;
+            }
             for _ in 0..SPINS {
                 std::hint::spin_loop();
             }
@@ -79,11 +89,24 @@ impl Shared {
         }
     }
 
+    /// Whether there is an errand; whoever is told so has it.
+    fn take_errand(&self) -> bool {
+        self.errand_wanted.load(Ordering::Relaxed) && self.errand_wanted.swap(false, Ordering::AcqRel)
+    }
+
+    fn run_errand(&self) {
+        if let Some(errand) = self.errand.get() {
+            // Whoever waits for it sees that it has brought nothing, and does it without the helper.
+            let _ = std::panic::catch_unwind(std::panic::AssertUnwindSafe(errand));
+        }
+    }
+
     fn sleep(&self) {
         self.asleep.store(true, Ordering::SeqCst);
         // Work that was published in between is seen here, or its publisher sees `asleep`.
         let ticket = self.ticket.load(Ordering::SeqCst);
-        let nothing = ticket & 0xffff >= (ticket >> BITS) & 0xffff;
+        let nothing =
+            ticket & 0xffff >= (ticket >> BITS) & 0xffff && !self.errand_wanted.load(Ordering::SeqCst);
         if nothing && !self.ends.load(Ordering::SeqCst) {
             std::thread::park();
         }
@@ -124,6 +147,25 @@ impl Team {
         if self.shared.asleep.load(Ordering::SeqCst) {
             self.thread.unpark();
         }
+    }
+
+    /// What [`Self::send`] sends the helper to do; a second errand is refused.
+    ///
+    /// # Errors
+    /// The errand, where there is one already.
+    pub fn set_errand(&self, errand: Errand) -> Result<(), Errand> {
+        self.shared.errand.set(errand)
+    }
+
+    /// Sends the helper on its errand, which it begins as soon as it has nothing else to do.
+    pub fn send(&self) {
+        self.shared.errand_wanted.store(true, Ordering::SeqCst);
+        self.wake();
+    }
+
+    /// Calls the errand off; whether the helper had not begun it.
+    pub fn call_off(&self) -> bool {
+        self.shared.take_errand()
     }
 
     /// Runs `work(0)` to `work(chunks - 1)`, in any order, on both threads. Only one thread may call this at a time; `&mut` makes sure.
@@ -179,6 +221,31 @@ mod tests {
                     runs[chunk].fetch_add(1, Ordering::Relaxed);
                 });
                 assert!(runs.iter().all(|runs| runs.load(Ordering::Relaxed) == 1), "{round}: {runs:?}");
+            }
+        }
+    }
+
+    #[test]
+    fn an_errand_is_run_once_or_called_off() {
+        for spin in [Duration::ZERO, Duration::from_millis(50)] {
+            let mut team = Team::start(spin).unwrap();
+            let runs = Arc::new(AtomicUsize::new(0));
+            let errand = Arc::clone(&runs);
+            let set = team.set_errand(Box::new(move || {
+                errand.fetch_add(1, Ordering::SeqCst);
+            }));
+            assert!(set.is_ok() && team.set_errand(Box::new(|| {})).is_err());
+            for round in 1..2000_usize {
+                let before = runs.load(Ordering::SeqCst);
+                team.send();
+                if round % 3 == 0 {
+                    team.each(2, &|_| {});
+                }
+                let called_off = round % 2 == 0 && team.call_off();
+                while !called_off && runs.load(Ordering::SeqCst) == before {
+                    std::hint::spin_loop();
+                }
+                assert_eq!(runs.load(Ordering::SeqCst), before + usize::from(!called_off), "{round}");
             }
         }
     }

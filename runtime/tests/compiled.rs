@@ -9,6 +9,8 @@ use rcwm_runtime::compile::{Optimizations, compile};
 use rcwm_runtime::engine::{EngineKind, Form};
 use rcwm_runtime::policy::Sampling;
 use rcwm_runtime::{EngineSettings, Policy};
+use rustix::process::Pid;
+use rustix::thread::{CpuSet, sched_getcpu, sched_setaffinity};
 use support::{image, smallest_bundle};
 
 fn policy(bundle: &Bundle, settings: EngineSettings) -> Policy {
@@ -116,6 +118,62 @@ fn a_rehearsal_changes_no_bit_of_what_follows() {
             assert_eq!(found.action.map(f32::to_bits), expected.action.map(f32::to_bits), "step {step}");
             assert_eq!((found.surprise, found.recomputed), (expected.surprise, expected.recomputed));
             assert_eq!(rehearsed.state(), plain.state(), "step {step}");
+        }
+    }
+}
+
+/// The helper is kept from running, then let go, again and again: what it brings too late is never taken for what was asked last.
+#[test]
+fn a_second_thread_that_is_late_is_done_without_and_changes_no_bit() {
+    let bundle = Bundle::open(&smallest_bundle()).unwrap();
+    std::thread::spawn(move || {
+        let settings = with(Optimizations::EXACT);
+        let (mut alone, mut beside) = (policy(&bundle, settings), policy(&bundle, settings.with_threads(2)));
+        let mut late = [0, 0];
+        for step in 0..400 {
+            let starved = step / 10 % 2 == 0;
+            if step % 10 == 0 {
+                starve_helpers(starved, if step % 40 == 0 { libc::SCHED_IDLE } else { libc::SCHED_OTHER });
+            }
+            let executed = [0.1, (step as f32).cos(), -0.4, 0.0];
+            let executed = (step > 0).then_some(&executed);
+            let expected = alone.observe(&image(step), executed).unwrap();
+            let found = beside.observe(&image(step), executed).unwrap();
+            late[usize::from(starved)] += u32::from(found.helper_late);
+            assert!(!expected.helper_late);
+            assert_eq!(found.action.map(f32::to_bits), expected.action.map(f32::to_bits), "step {step}");
+            assert_eq!(beside.state(), alone.state(), "step {step}");
+        }
+        // On a busy machine it may be late at any time.
+        assert!(late[1] > 20 && late[0] <= late[1], "late, let go and kept from running: {late:?}");
+    })
+    .join()
+    .unwrap();
+}
+
+/// Gives the ticks' second threads the core of the calling thread, and of that a tenth, so that they are stopped half-way, or with SCHED_IDLE hardly anything; or
+/// all cores.
+fn starve_helpers(starve: bool, policy: i32) {
+    let mut all = CpuSet::new();
+    for cpu in std::thread::available_parallelism().iter().flat_map(|cores| 0..cores.get()) {
+        all.set(cpu);
+    }
+    let mut one = CpuSet::new();
+    one.set(sched_getcpu());
+    let cpus = if starve { one } else { all };
+    sched_setaffinity(None, &cpus).unwrap();
+    for task in std::fs::read_dir("/proc/self/task").unwrap().flatten() {
+        if std::fs::read_to_string(task.path().join("comm")).is_ok_and(|name| name.trim_end() == "rcwm-tick")
+        {
+            let id: i32 = task.file_name().to_str().unwrap().parse().unwrap();
+            let parameters = libc::sched_param { sched_priority: 0 };
+            // One that has ended meanwhile belongs to another test; the way back may need a privilege, and is not needed.
+            let _ = sched_setaffinity(Pid::from_raw(id), &cpus);
+            // SAFETY: the parameters live through the calls.
+            unsafe {
+                libc::sched_setscheduler(id, policy, &raw const parameters);
+                libc::setpriority(libc::PRIO_PROCESS, id as libc::id_t, if starve { 10 } else { 0 });
+            }
         }
     }
 }

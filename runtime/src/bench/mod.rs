@@ -1,27 +1,34 @@
 //! The tick's latency on this machine, several ways of running it interleaved in one run on the bundle's golden images.
 //!
 //! What varies with the machine's mood (clock, neighbours) then hits all alike: in every round each runs one tick, and the order turns by one
-//! from round to round. `tick` is image in, action out; what is worked ahead of the image is `ahead`, measured beside it.
+//! from round to round. `tick` is image in, action out; what is worked ahead of the image is `ahead`, measured beside it. How much of the tails is the
+//! machine's own shows a control in the same rounds.
 
+mod control;
 mod ladder;
 mod limit;
 mod report;
 
+pub use control::ControlBench;
 pub use ladder::{Case, engines, ladder};
 pub use limit::{Limit, Machine, Stalls, measure_machine, measure_stalls};
 pub use report::{BenchReport, CaseBench, Step};
 
-use std::time::Instant;
+use std::time::{Duration, Instant};
 
 use rcwm_models::ACTION_LEN;
 use rcwm_models::bundle::Bundle;
 use rcwm_models::tensors::TensorsError;
 
 use crate::compile::{CompileError, Optimizations, compile};
+use crate::engine::EngineSettings;
 use crate::inspect::{Cost, CostError, InspectError, inspect};
 use crate::policy::{Policy, PolicyError, Sampling};
 use crate::realtime;
 use crate::telemetry::{Curve, LatencyFiles, PlotError, Stage, Telemetry, plot};
+
+use control::Control;
+use ladder::SINGLE;
 
 /// Most ticks of the warm-up.
 const WARM_UP_MAX: usize = 2000;
@@ -56,7 +63,10 @@ struct Runner {
     case: Case,
     policy: Policy,
     telemetry: Telemetry,
+    /// What was measured before the measurement.
+    warm_up: Telemetry,
     executed: Option<[f32; ACTION_LEN]>,
+    helper_late: u64,
 }
 
 /// Runs every case for `ticks` ticks after a tenth of them, at most 2000, unmeasured. With `real_time`, the calling thread and the ticks' second
@@ -73,13 +83,7 @@ pub fn bench(
 ) -> Result<Measured, BenchError> {
     let machine = measure_machine(inspect(bundle)?.tick.weight_bytes)?;
     let limit = machine.of(&late_cost(bundle)?);
-    let mut runners = cases
-        .iter()
-        .map(|case| {
-            let policy = Policy::new(bundle, case.settings, Sampling::Mode)?;
-            Ok(Runner { case: *case, policy, telemetry: Telemetry::new(), executed: None })
-        })
-        .collect::<Result<Vec<_>, PolicyError>>()?;
+    let mut runners = cases.iter().map(|case| Runner::new(bundle, *case)).collect::<Result<Vec<_>, _>>()?;
     let granted = real_time.and_then(realtime::ask);
     let stalls = measure_stalls();
     let images = bundle.golden.u8("input/image")?;
@@ -88,14 +92,21 @@ pub fn bench(
     let images = images.ok_or(TensorsError::Missing { name: "input/image, at least one tick".into() })?;
     let image_len = images.len() / count;
     let warm_up = (ticks / 10).min(WARM_UP_MAX);
+    let mut controls = Vec::new();
     let mut measured = 0;
     let mut rested = Instant::now();
     for round in 0..warm_up + ticks {
+        if round == warm_up {
+            controls = make_controls(&runners)?;
+            // Threads that have begun only now.
+            let _ = real_time.map(realtime::ask_for_helpers);
+        }
         let image = &images[round % count * image_len..][..image_len];
         for turn in 0..runners.len() {
             let index = (round + turn) % cases.len();
             runners[index].tick(image, round % count == 0, round >= warm_up)?;
         }
+        controls.iter_mut().for_each(Control::measure);
         measured += usize::from(round >= warm_up);
         if granted.is_some() {
             // As a controller rests between its ticks; a thread of a fixed priority that never does is stopped for some time.
@@ -109,18 +120,35 @@ pub fn bench(
     if measured == 0 {
         return Err(BenchError::Stopped);
     }
+    let controls = controls.iter().map(Control::report).collect();
+    let conditions = Conditions { stalls, granted, controls };
+    let late: Vec<u64> = runners.iter().map(|runner| runner.helper_late).collect();
     let runs: Vec<(Case, Telemetry)> =
         runners.into_iter().map(|runner| (runner.case, runner.telemetry)).collect();
-    Ok(Measured {
-        report: BenchReport::new(bundle, measured, limit, Conditions { stalls, granted }, &runs),
-        runs,
-    })
+    Ok(Measured { report: BenchReport::new(bundle, measured, limit, conditions, &runs, &late), runs })
+}
+
+/// One for tract on one thread and one for tract as deployed, where they run; they take as long as those took in the warm-up.
+fn make_controls(runners: &[Runner]) -> Result<Vec<Control>, BenchError> {
+    let deployed = EngineSettings::tract();
+    let mut settings = vec![SINGLE];
+    settings.extend((deployed.threads > 1).then_some(deployed));
+    let mut controls = Vec::new();
+    for settings in settings {
+        let runs = |runner: &&Runner| runner.case.settings == settings && runner.case.rehearses;
+        if let Some(runner) = runners.iter().find(runs) {
+            let p50_us = runner.warm_up.latency(Stage::Tick).p50_us;
+            controls.push(Control::new(settings.threads, Duration::from_secs_f64(p50_us / 1e6))?);
+        }
+    }
+    Ok(controls)
 }
 
 /// Under which conditions was measured.
 pub(crate) struct Conditions {
     stalls: Stalls,
     granted: Option<realtime::Granted>,
+    controls: Vec<ControlBench>,
 }
 
 /// What was measured: the report, and every time behind it.
@@ -170,6 +198,12 @@ fn late_cost(bundle: &Bundle) -> Result<Cost, BenchError> {
 }
 
 impl Runner {
+    fn new(bundle: &Bundle, case: Case) -> Result<Self, PolicyError> {
+        let policy = Policy::new(bundle, case.settings, Sampling::Mode)?;
+        let (telemetry, warm_up) = (Telemetry::new(), Telemetry::new());
+        Ok(Self { case, policy, telemetry, warm_up, executed: None, helper_late: 0 })
+    }
+
     /// Ahead first, as a controller does after it has sent an action, then ready for the image, as it does before one is expected; then the
     /// image, as if it came now.
     fn tick(&mut self, image: &[u8], is_first: bool, measured: bool) -> Result<(), PolicyError> {
@@ -188,7 +222,10 @@ impl Runner {
         let decision = self.policy.observe(image, executed.as_ref())?;
         let tick_ns = start.elapsed().as_nanos() as u64;
         self.executed = Some(decision.action);
-        if measured {
+        if !measured {
+            self.warm_up.record(Stage::Tick, tick_ns);
+        } else {
+            self.helper_late += u64::from(decision.helper_late);
             self.telemetry.record(Stage::Tick, tick_ns);
             self.telemetry.record(Stage::Ahead, ahead_ns);
             self.telemetry.record(Stage::Ready, ready_ns);

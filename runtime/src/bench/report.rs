@@ -4,7 +4,7 @@ use rcwm_models::bundle::Bundle;
 use serde::Serialize;
 
 use super::ladder::{SINGLE, YARDSTICK};
-use super::{Case, Conditions, Limit, Stalls};
+use super::{Case, Conditions, ControlBench, Limit, Stalls};
 use crate::engine::EngineSettings;
 use crate::realtime::Granted;
 use crate::telemetry::{Latency, Stage, Telemetry, table};
@@ -17,6 +17,8 @@ pub struct CaseBench {
     pub case: Case,
     /// The limit by arithmetic over the median: of one thread, or of two that share everything evenly.
     pub share_of_limit: f64,
+    /// Ticks for which the second thread came too late, so that the first did without it.
+    pub helper_late: u64,
     /// Percentiles per stage; `tick` is image in, action out.
     pub latency: Vec<Latency>,
 }
@@ -50,6 +52,10 @@ pub struct BenchReport {
     pub share_of_limit_single_thread: Option<f64>,
     /// Three-nines over median of tract as deployed.
     pub p999_over_p50: Option<f64>,
+    /// The same of tract with one thread.
+    pub p999_over_p50_single_thread: Option<f64>,
+    /// Arithmetic in registers that takes as long as tract's ticks, measured in the same rounds: the tails that are the machine's own.
+    pub controls: Vec<ControlBench>,
     /// The limit of one thread.
     pub limit: Limit,
     /// What the machine takes from any thread.
@@ -67,17 +73,21 @@ impl BenchReport {
         limit: Limit,
         conditions: Conditions,
         runs: &[(Case, Telemetry)],
+        helper_late: &[u64],
     ) -> Self {
         let engines: Vec<CaseBench> = runs
             .iter()
-            .map(|(case, telemetry)| CaseBench {
+            .zip(helper_late)
+            .map(|((case, telemetry), helper_late)| CaseBench {
                 case: *case,
+                helper_late: *helper_late,
                 share_of_limit: share(&limit, case.settings, telemetry.latency(Stage::Tick).p50_us),
                 latency: telemetry.latencies(),
             })
             .collect();
         let find = |settings: EngineSettings| engines.iter().find(|bench| bench.case.settings == settings);
         let (deployed, single, yardstick) = (find(EngineSettings::tract()), find(SINGLE), find(YARDSTICK));
+        let tail = |bench: &CaseBench| bench.tick().map(|tick| tick.p999_us / tick.p50_us);
         let ratio = |bench: Option<&CaseBench>| Some(bench?.tick()?.p50_us / yardstick?.tick()?.p50_us);
         Self {
             preset: bundle.manifest.provenance.preset.clone(),
@@ -86,7 +96,9 @@ impl BenchReport {
             ratio_p50_vs_ort_single_thread: ratio(single),
             share_of_limit: deployed.map(|bench| bench.share_of_limit),
             share_of_limit_single_thread: single.map(|bench| bench.share_of_limit),
-            p999_over_p50: deployed.and_then(CaseBench::tick).map(|tick| tick.p999_us / tick.p50_us),
+            p999_over_p50: deployed.and_then(tail),
+            p999_over_p50_single_thread: single.and_then(tail),
+            controls: conditions.controls,
             limit,
             stalls: conditions.stalls,
             realtime: conditions.granted,
@@ -116,8 +128,15 @@ impl BenchReport {
         }
         for bench in &self.engines {
             let threads = bench.case.settings.threads;
-            text += &format!("{:<10} {threads} thread(s)\n", bench.case.name);
+            let late = match bench.helper_late {
+                0 => String::new(),
+                late => format!(", the second too late for {late} ticks"),
+            };
+            text += &format!("{:<10} {threads} thread(s){late}\n", bench.case.name);
             text += &table(&bench.latency);
+        }
+        for control in &self.controls {
+            text += &control.line();
         }
         for (name, value) in [
             ("ratio_p50_vs_ort", self.ratio_p50_vs_ort),
@@ -125,6 +144,7 @@ impl BenchReport {
             ("share_of_limit", self.share_of_limit),
             ("share_of_limit_single_thread", self.share_of_limit_single_thread),
             ("p999_over_p50", self.p999_over_p50),
+            ("p999_over_p50_single_thread", self.p999_over_p50_single_thread),
         ] {
             if let Some(value) = value {
                 text += &format!("{name} {value:.3}\n");

@@ -135,6 +135,7 @@ impl EngineChoice {
 /// Runs the program on the process's arguments.
 #[must_use]
 pub fn main() -> ExitCode {
+    crate::realtime::keep_memory();
     let result = match Arguments::parse().verb {
         Verb::Run(arguments) => run::run(&arguments),
         Verb::Swap(arguments) => swap::run(&arguments),

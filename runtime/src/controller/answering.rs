@@ -151,6 +151,7 @@ impl Controller {
         };
         self.record_stages(&decision);
         self.counters.recomputed += u64::from(decision.recomputed);
+        self.counters.helper_late += u64::from(decision.helper_late);
         // Every scene is new at the first image of an episode.
         let surprise = decision.surprise.filter(|_| !is_first);
         let Some(surprise) = surprise else { return (Some(decision), Event::Decided) };

@@ -42,6 +42,8 @@ pub struct Counters {
     pub environment_surprises: u64,
     /// Ticks whose work ahead was for another action than was executed, and was done again.
     pub recomputed: u64,
+    /// Ticks for which the second thread came too late, so that the first computed its branch too.
+    pub helper_late: u64,
     /// Actions that the rate limit has changed.
     pub rate_limited: u64,
     /// Answers that were not sent because a newer observation had come before they were ready.
@@ -255,14 +257,15 @@ impl RunReport {
     fn counter_lines(&self) -> String {
         let c = &self.counters;
         let mut text = format!(
-            "counts     observations {}, answers {}, repeated {}, stale {}, missed observations {}, recomputed {}, peer \
-             restarts {}, peers lost {}\n",
+            "counts     observations {}, answers {}, repeated {}, stale {}, missed observations {}, recomputed {}, second \
+             thread late {}, peer restarts {}, peers lost {}\n",
             c.observations,
             c.answers,
             c.repeated_observations,
             c.stale_observations,
             c.missed_observations,
             c.recomputed,
+            c.helper_late,
             c.peer_restarts,
             c.peers_lost
         );

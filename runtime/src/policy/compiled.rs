@@ -3,14 +3,15 @@
 //! What needs only the action runs ahead of the image; once it is there, encoder, both posteriors (on two threads) and the actor stand between
 //! it and the action.
 
+mod branches;
 mod pieces;
 
 use std::sync::{Arc, Mutex};
-use std::time::{Duration, Instant};
+use std::time::Duration;
 
 use rcwm_models::ACTION_LEN;
 use rcwm_models::bundle::{Bundle, PartName};
-use tract_onnx::prelude::{TValue, TVec, TractResult};
+use tract_onnx::prelude::TractResult;
 
 use super::parts::finite;
 use super::stages::StageClock;
@@ -20,6 +21,7 @@ use crate::compile::{CompileError, Optimizations, compile, inputs};
 use crate::engine::{EngineError, weights};
 use crate::operators::SharedTeam;
 use crate::team::Team;
+use branches::Branches;
 use pieces::{Piece, Values};
 
 /// How long the helper looks for work after the last before it sleeps.
@@ -31,8 +33,7 @@ pub(super) struct Compiled {
     /// Early, in the order they run.
     early: Vec<Piece>,
     encoder: Piece,
-    /// The posterior of each branch.
-    branches: [Piece; 2],
+    branches: Branches,
     actor: Piece,
     team: Option<SharedTeam>,
 }
@@ -78,35 +79,8 @@ impl Compiled {
             found.ok_or_else(|| CompileError::Part { part, reason: reason() })
         };
         let (encoder, actor) = (late(PartName::Encoder)?, late(PartName::Actor)?);
-        let branches = [late(PartName::Robot)?, late(PartName::Environment)?];
+        let branches = Branches::new(late(PartName::Robot)?, late(PartName::Environment)?, team.as_ref())?;
         Ok(Self { values, early, encoder, branches, actor, team })
-    }
-
-    /// The posteriors, side by side.
-    fn run_branches(&mut self, clock: &mut StageClock) -> TractResult<()> {
-        let Some(team) = &self.team else {
-            for piece in &mut self.branches {
-                piece.run(&mut self.values)?;
-                clock.ended(piece.part);
-            }
-            return Ok(());
-        };
-        let values = &self.values;
-        let lanes = self.branches.each_mut().map(|piece| {
-            let inputs = piece.inputs(values);
-            Mutex::new(Lane { piece, inputs, result: None, spent_ns: 0 })
-        });
-        team.lock().unwrap_or_else(std::sync::PoisonError::into_inner).each(lanes.len(), &|index| {
-            lanes[index].lock().unwrap_or_else(std::sync::PoisonError::into_inner).run();
-        });
-        for lane in lanes {
-            let lane = lane.into_inner().unwrap_or_else(std::sync::PoisonError::into_inner);
-            let results = lane.result.unwrap_or_else(|| Ok(TVec::new()))?;
-            lane.piece.keep(results, &mut self.values);
-            clock.took(lane.piece.part, lane.spent_ns);
-        }
-        clock.restart();
-        Ok(())
     }
 
     /// The actor on the state that is there.
@@ -168,22 +142,6 @@ impl Compiled {
     }
 }
 
-/// A branch's piece on one of two threads.
-struct Lane<'a> {
-    piece: &'a mut Piece,
-    inputs: TVec<TValue>,
-    result: Option<TractResult<TVec<TValue>>>,
-    spent_ns: u64,
-}
-
-impl Lane<'_> {
-    fn run(&mut self) {
-        let start = Instant::now();
-        self.result = Some(self.piece.run_on(std::mem::take(&mut self.inputs)));
-        self.spent_ns = start.elapsed().as_nanos() as u64;
-    }
-}
-
 fn run_error(part: PartName, error: &tract_onnx::prelude::TractError) -> PolicyError {
     let reason = format!("{error:#}");
     EngineError::Run { engine: crate::EngineKind::Tract, part, reason: crate::engine::one_line(&reason) }
@@ -207,7 +165,7 @@ impl Tick for Compiled {
         let encoded = values.fill(inputs::IMAGE, image).and_then(|()| encoder.run(values));
         encoded.map_err(|error| run_error(PartName::Encoder, &error))?;
         work.clock.ended(PartName::Encoder);
-        self.run_branches(work.clock).map_err(|error| run_error(PartName::Robot, &error))?;
+        self.branches.run(&mut self.values, work.clock).map_err(|(part, error)| run_error(part, &error))?;
         self.copy_posteriors(work.buffers)?;
         work.buffers.check_posteriors()?;
         self.act(work)
@@ -224,7 +182,7 @@ impl Tick for Compiled {
     fn rehearse(&mut self) {
         // The last image in place of the next. What comes out, an error included, is overwritten by whatever comes next.
         let _ = self.encoder.run(&mut self.values);
-        let _ = self.run_branches(&mut StageClock::start());
+        let _ = self.branches.rehearse(&mut self.values, &mut StageClock::start());
         let _ = self.actor.run(&mut self.values);
     }
 

@@ -97,6 +97,8 @@ pub struct Decision {
     pub surprise: Option<Surprise>,
     /// What had been worked ahead was for another action than was executed, and was done again.
     pub recomputed: bool,
+    /// The second thread was not there in time, and its branch was computed by the first.
+    pub helper_late: bool,
 }
 
 /// What led to the observation to come.
@@ -162,6 +164,7 @@ impl Policy {
                 Ok(_) | Err(PolicyError::NotFinite { .. }) => {}
                 Err(error) => return Err(error),
             }
+            self.expect_image();
         }
         self.noise = NoiseSource::new(sampling, &self.manifest.model);
         self.ahead = None;
@@ -211,7 +214,7 @@ impl Policy {
         tick.observe(image, &mut work)?;
         self.state.take_posterior(&self.buffers);
         let surprise = Some(self.buffers.surprise());
-        Ok(self.decide(clock.spent_ns, surprise, recomputed))
+        Ok(self.decide(&clock, surprise, recomputed))
     }
 
     /// Computes all of the next tick that needs only the action before it (robot prior, interaction, environment's recurrence),
@@ -267,7 +270,7 @@ impl Policy {
         let (tick, mut work) = self.work(&mut clock);
         tick.imagine(&mut work)?;
         self.state.take_posterior(&self.buffers);
-        Ok(self.decide(clock.spent_ns, None, recomputed))
+        Ok(self.decide(&clock, None, recomputed))
     }
 
     fn before(action: Option<&[f32; ACTION_LEN]>) -> Result<Before, PolicyError> {
@@ -305,15 +308,11 @@ impl Policy {
         (tick.as_mut(), Work { state, noise, buffers, clock })
     }
 
-    fn decide(
-        &mut self,
-        stage_ns: [u64; STAGES.len()],
-        surprise: Option<Surprise>,
-        recomputed: bool,
-    ) -> Decision {
+    fn decide(&mut self, clock: &StageClock, surprise: Option<Surprise>, recomputed: bool) -> Decision {
+        let StageClock { spent_ns: stage_ns, helper_late, .. } = *clock;
         let (mean, std) = (self.buffers.mean, self.buffers.std);
         let action = self.limits.clamp(self.noise.action(&mean, &std));
-        Decision { action, mean, std, stage_ns, surprise, recomputed }
+        Decision { action, mean, std, stage_ns, surprise, recomputed, helper_late }
     }
 
     /// Goes back to the learned initial state.

@@ -11,11 +11,13 @@ pub(super) struct StageClock {
     last: Instant,
     /// Time spent in each of [`STAGES`], in ns.
     pub(super) spent_ns: [u64; STAGES.len()],
+    /// The second thread was not waited for.
+    pub(super) helper_late: bool,
 }
 
 impl StageClock {
     pub(super) fn start() -> Self {
-        Self { last: Instant::now(), spent_ns: [0; STAGES.len()] }
+        Self { last: Instant::now(), spent_ns: [0; STAGES.len()], helper_late: false }
     }
 
     /// The stage has ended now.

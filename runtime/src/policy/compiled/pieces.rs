@@ -6,6 +6,7 @@ use std::sync::Arc;
 use rcwm_models::bundle::PartName;
 use rcwm_models::onnx::data_type;
 use tract_onnx::prelude::*;
+use tract_onnx::tract_core::plan::eval;
 
 use super::super::PolicyError;
 use crate::compile::{CompileError, Fact, Segment};
@@ -71,6 +72,11 @@ impl Values {
     }
 }
 
+/// Somebody else was faster.
+#[derive(Debug, thiserror::Error)]
+#[error("no longer wanted")]
+struct Unwanted;
+
 /// A segment in tract.
 pub(super) struct Piece {
     pub(super) part: PartName,
@@ -106,6 +112,12 @@ impl Piece {
         Ok(Self { part: segment.part, inputs, outputs, state })
     }
 
+    /// The same again, with memory of its own; weights are shared.
+    pub(super) fn twin(&self) -> TractResult<Self> {
+        let state = TypedSimpleState::new(self.state.plan())?;
+        Ok(Self { part: self.part, inputs: self.inputs.clone(), outputs: self.outputs.clone(), state })
+    }
+
     pub(super) fn makes(&self, values: &Values, name: &str) -> bool {
         values.places.get(name).is_some_and(|place| self.outputs.contains(place))
     }
@@ -117,6 +129,21 @@ impl Piece {
 
     pub(super) fn run_on(&mut self, inputs: TVec<TValue>) -> TractResult<TVec<TValue>> {
         self.state.run(inputs)
+    }
+
+    /// The same, given up between two of its operators as soon as it is unwanted; none then.
+    pub(super) fn run_unless(
+        &mut self,
+        unwanted: impl Fn() -> bool,
+        inputs: TVec<TValue>,
+    ) -> TractResult<Option<TVec<TValue>>> {
+        let result = self.state.run_plan_with_eval(inputs, |context, state, node, inputs| {
+            if unwanted() { Err(Unwanted.into()) } else { eval(context, state, node, inputs) }
+        });
+        match result {
+            Err(error) if error.is::<Unwanted>() => self.state.reset_turn().map(|()| None),
+            result => result.map(Some),
+        }
     }
 
     /// Puts what came out where others find it.
