@@ -13,8 +13,8 @@
 //! ```
 //!
 //! Waiting blocks until shortly before the expected time, gets ready for what will come, polls from there to shortly after the expected
-//! time, and blocks again. How long getting ready takes is learnt from how long it took. Where ticks
-//! were slept through, only the newest is made up for: the others are counted, never run in a burst. In lock-step nothing is due.
+//! time, and blocks again. How long getting ready takes is learnt from how long it took, and when it is to be done by from how soon after their schedule
+//! observations have come lately. Where ticks were slept through, only the newest is made up for: the others are counted, never run in a burst. In lock-step nothing is due.
 
 use std::time::Duration;
 
@@ -80,6 +80,8 @@ pub struct Pacing {
     schedule: Option<Schedule>,
     /// How long before polling to get ready.
     lead_ns: u64,
+    /// How soon after its schedule an observation may be published, from the last ones.
+    soonest_ns: Option<u64>,
 }
 
 #[derive(Debug, Clone, Copy)]
@@ -88,6 +90,8 @@ struct Schedule {
     scheduled_ns: u64,
     /// The later of scheduled and published.
     base_ns: u64,
+    /// How much sooner than expected the next one may come.
+    sooner_ns: u64,
     period_ns: u64,
     grace_ns: u64,
     /// Ticks after `sequence` that were found overdue.
@@ -107,7 +111,7 @@ impl Pacing {
     /// Nothing is due yet.
     #[must_use]
     pub fn new(settings: PacingSettings) -> Self {
-        Self { settings, schedule: None, lead_ns: 0 }
+        Self { settings, schedule: None, lead_ns: 0, soonest_ns: None }
     }
 
     /// Takes the schedule over from an observation. After the last of an episode nothing is due: a reset takes its time.
@@ -117,10 +121,17 @@ impl Pacing {
             return;
         }
         let period_ns = observation.period_ns.max(PERIOD_NS_MIN);
+        let lag_ns = observation.published_ns.saturating_sub(observation.scheduled_ns);
+        // Down at once, up slowly.
+        let soonest_ns = self
+            .soonest_ns
+            .map_or(lag_ns, |soonest| lag_ns.min(soonest.saturating_add(lag_ns.abs_diff(soonest) / 32)));
+        self.soonest_ns = Some(soonest_ns);
         self.schedule = Some(Schedule {
             sequence: observation.sequence,
             scheduled_ns: observation.scheduled_ns,
             base_ns: observation.scheduled_ns.max(observation.published_ns),
+            sooner_ns: lag_ns - soonest_ns,
             period_ns,
             grace_ns: share(period_ns, self.settings.grace_periods),
             overdue: 0,
@@ -166,7 +177,7 @@ impl Pacing {
         let until = |time_ns: u64| Duration::from_nanos(time_ns - now_ns);
         let (spin_from_ns, spin_until_ns) =
             (expected_ns.saturating_sub(spin_ns), expected_ns.saturating_add(spin_ns));
-        let lead_ns = self.lead_ns.min(schedule.period_ns / LEAD_SHARE);
+        let lead_ns = self.lead_ns.saturating_add(schedule.sooner_ns).min(schedule.period_ns / LEAD_SHARE);
         let ready_from_ns = spin_from_ns.saturating_sub(lead_ns);
         // Once it is expected, what comes is not to wait for this.
         let is_ready =
@@ -263,6 +274,26 @@ mod tests {
         let mut pacing = ready(pacing, 80_000);
         assert!(pacing.take_overdue(PUBLISHED_NS + PERIOD_NS * 3 / 2).is_some());
         assert_eq!(pacing.plan(polls_ns + PERIOD_NS - 1), Plan::GetReady, "the one that was missing is over");
+    }
+
+    #[test]
+    fn it_gets_ready_for_an_observation_that_comes_as_soon_as_others_came() {
+        let mut pacing = ready(after(&observation()), 80_000);
+        let mut late = observation();
+        late.published_ns += 64_000;
+        pacing.observed(&late);
+        let polls_ns = late.published_ns + PERIOD_NS - 100_000;
+        // 64 us sooner than expected, of which a 32nd is forgotten.
+        assert_eq!(pacing.plan(polls_ns - 100_000 - 62_001), wait(0, 1));
+        assert_eq!(pacing.plan(polls_ns - 100_000 - 62_000), Plan::GetReady);
+        for _ in 0..500 {
+            pacing.observed(&late);
+        }
+        assert_ne!(pacing.plan(polls_ns - 100_100), Plan::GetReady, "they come later now");
+        late.published_ns += 100 * PERIOD_NS;
+        pacing.observed(&late);
+        let polls_ns = late.published_ns + PERIOD_NS - 100_000;
+        assert_eq!(pacing.plan(polls_ns - PERIOD_NS / 4 - 1), wait(0, 1), "never earlier than that");
     }
 
     #[test]
