@@ -13,8 +13,10 @@ use crate::telemetry::{Stage, Telemetry};
 /// Numbers that are worked on side by side: they fit into the registers of any x86, and keep its units for arithmetic busy, so that a core that has to be shared
 /// shows.
 const WIDTH: usize = 48;
+/// Rounds of a step, in which they stay in the registers.
+const ROUNDS: usize = 32;
 /// Steps of the first guess at how long a step takes.
-const GUESS_STEPS: u64 = 20_000;
+const GUESS_STEPS: u64 = 500;
 /// Repetitions of the guess; the median counts.
 const GUESSES: usize = 15;
 /// How long the second thread looks for work: hardly, for it must not be in the way of what is measured next.
@@ -102,10 +104,12 @@ impl Control {
 fn arithmetic(steps: u64) {
     let mut numbers = [1.0_f32; WIDTH];
     for _ in 0..steps {
-        for number in &mut numbers {
-            *number = *number * 0.999 + 0.001;
+        for _ in 0..ROUNDS {
+            for number in &mut numbers {
+                *number = *number * 0.999 + 0.001;
+            }
         }
-        // So that the loop is not worked out beforehand; it stays in registers.
+        // So that the loop is not worked out beforehand.
         numbers = black_box(numbers);
     }
     black_box(numbers);

@@ -19,6 +19,8 @@ use crate::team::Team;
 
 /// The helper is late when the caller has waited for this part of the time that its own branch has taken.
 const PATIENCE: u32 = 4;
+/// And at least so long: two cores are seldom equally fast.
+const PATIENCE_MIN: Duration = Duration::from_micros(15);
 
 /// An error, and the part it comes from.
 pub(super) type RunError = (PartName, TractError);
@@ -139,7 +141,7 @@ impl Beside {
         let start = Instant::now();
         self.robot.run(values).map_err(|error| (self.robot.part, error))?;
         clock.ended(self.robot.part);
-        self.wait(start.elapsed() / PATIENCE);
+        self.wait(PATIENCE_MIN.max(start.elapsed() / PATIENCE));
         let (results, spent_ns) = match self.brought() {
             Some(brought) => brought,
             None => self.take_over(values, clock),

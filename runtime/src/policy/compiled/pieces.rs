@@ -83,6 +83,8 @@ pub(super) struct Piece {
     inputs: Vec<usize>,
     outputs: Vec<usize>,
     state: TypedSimpleState,
+    /// Made beforehand: an error that is made in a tick asks the allocator, and may look at the whole stack.
+    unwanted: Option<TractError>,
 }
 
 impl Piece {
@@ -109,13 +111,14 @@ impl Piece {
             .collect::<TractResult<_>>()?;
         let outputs =
             segment.outputs.iter().map(|name| values.place(name, None)).collect::<TractResult<_>>()?;
-        Ok(Self { part: segment.part, inputs, outputs, state })
+        Ok(Self { part: segment.part, inputs, outputs, state, unwanted: Some(Unwanted.into()) })
     }
 
     /// The same again, with memory of its own; weights are shared.
     pub(super) fn twin(&self) -> TractResult<Self> {
         let state = TypedSimpleState::new(self.state.plan())?;
-        Ok(Self { part: self.part, inputs: self.inputs.clone(), outputs: self.outputs.clone(), state })
+        let (inputs, outputs) = (self.inputs.clone(), self.outputs.clone());
+        Ok(Self { part: self.part, inputs, outputs, state, unwanted: Some(Unwanted.into()) })
     }
 
     pub(super) fn makes(&self, values: &Values, name: &str) -> bool {
@@ -137,11 +140,18 @@ impl Piece {
         unwanted: impl Fn() -> bool,
         inputs: TVec<TValue>,
     ) -> TractResult<Option<TVec<TValue>>> {
+        let error = &mut self.unwanted;
         let result = self.state.run_plan_with_eval(inputs, |context, state, node, inputs| {
-            if unwanted() { Err(Unwanted.into()) } else { eval(context, state, node, inputs) }
+            match error.take_if(|_| unwanted()) {
+                Some(error) => Err(error),
+                None => eval(context, state, node, inputs),
+            }
         });
         match result {
-            Err(error) if error.is::<Unwanted>() => self.state.reset_turn().map(|()| None),
+            Err(error) if error.is::<Unwanted>() => {
+                self.unwanted = Some(error);
+                self.state.reset_turn().map(|()| None)
+            }
             result => result.map(Some),
         }
     }
