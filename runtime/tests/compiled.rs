@@ -10,7 +10,7 @@ use rcwm_runtime::engine::{EngineKind, Form};
 use rcwm_runtime::policy::Sampling;
 use rcwm_runtime::{EngineSettings, Policy};
 use rustix::process::Pid;
-use rustix::thread::{CpuSet, sched_getcpu, sched_setaffinity};
+use rustix::thread::{CpuSet, sched_getaffinity, sched_getcpu, sched_setaffinity};
 use support::{image, smallest_bundle};
 
 fn policy(bundle: &Bundle, settings: EngineSettings) -> Policy {
@@ -129,38 +129,38 @@ fn a_second_thread_that_is_late_is_done_without_and_changes_no_bit() {
     std::thread::spawn(move || {
         let settings = with(Optimizations::EXACT);
         let (mut alone, mut beside) = (policy(&bundle, settings), policy(&bundle, settings.with_threads(2)));
-        let mut late = [0, 0];
+        let all = sched_getaffinity(None).unwrap();
+        let mut late = 0;
         for step in 0..400 {
             let starved = step / 10 % 2 == 0;
             if step % 10 == 0 {
-                starve_helpers(starved, if step % 40 == 0 { libc::SCHED_IDLE } else { libc::SCHED_OTHER });
+                let policy = if step % 40 == 0 { libc::SCHED_IDLE } else { libc::SCHED_OTHER };
+                starve_helpers(starved, policy, &all);
             }
             let executed = [0.1, (step as f32).cos(), -0.4, 0.0];
             let executed = (step > 0).then_some(&executed);
             let expected = alone.observe(&image(step), executed).unwrap();
             let found = beside.observe(&image(step), executed).unwrap();
-            late[usize::from(starved)] += u32::from(found.helper_late);
+            late += u32::from(starved && found.helper_late);
             assert!(!expected.helper_late);
             assert_eq!(found.action.map(f32::to_bits), expected.action.map(f32::to_bits), "step {step}");
             assert_eq!(beside.state(), alone.state(), "step {step}");
         }
-        // On a busy machine it may be late at any time.
-        assert!(late[1] > 20 && late[0] <= late[1], "late, let go and kept from running: {late:?}");
+        // Of the hundred ticks with SCHED_IDLE; how often it is late otherwise depends on what else the machine does.
+        assert!(late > 20, "late for {late} ticks");
     })
     .join()
     .unwrap();
 }
 
-/// Gives the ticks' second threads the core of the calling thread, and of that a tenth, so that they are stopped half-way, or with SCHED_IDLE hardly anything; or
-/// all cores.
-fn starve_helpers(starve: bool, policy: i32) {
-    let mut all = CpuSet::new();
-    for cpu in std::thread::available_parallelism().iter().flat_map(|cores| 0..cores.get()) {
-        all.set(cpu);
+/// Gives the ticks' second threads the core of the calling thread, and of that a tenth, so that they are stopped half-way, or with
+/// SCHED_IDLE hardly anything; or all the cores that there are for this process.
+fn starve_helpers(starve: bool, policy: i32, all: &CpuSet) {
+    let mut cpus = all.clone();
+    if starve {
+        cpus.clear();
+        cpus.set(sched_getcpu());
     }
-    let mut one = CpuSet::new();
-    one.set(sched_getcpu());
-    let cpus = if starve { one } else { all };
     sched_setaffinity(None, &cpus).unwrap();
     for task in std::fs::read_dir("/proc/self/task").unwrap().flatten() {
         if std::fs::read_to_string(task.path().join("comm")).is_ok_and(|name| name.trim_end() == "rcwm-tick")

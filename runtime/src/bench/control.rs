@@ -10,8 +10,8 @@ use super::BenchError;
 use crate::team::Team;
 use crate::telemetry::{Stage, Telemetry};
 
-/// Numbers that are worked on side by side: they fit into the registers of any x86, and keep its units for arithmetic busy, so that a core that has to be shared
-/// shows.
+/// Numbers that are worked on side by side: they fit into the registers of any x86, and keep its units for arithmetic busy, so that a
+/// core that has to be shared shows.
 const WIDTH: usize = 48;
 /// Rounds of a step, in which they stay in the registers.
 const ROUNDS: usize = 32;

@@ -110,9 +110,10 @@ fn throttled_share() -> Option<f64> {
     (runtime >= 0.0 && runtime < period).then(|| 1.0 - runtime / period)
 }
 
-/// Makes the process keep the memory it has been given. The C library's allocator hands the upper end of the heap back whenever 128 KiB of it are free,
-/// and gets it again from the kernel page by page: several page faults a tick. No more than 64 MiB are kept free so. For the whole process, without harm if
-/// called twice; for a program that runs ticks, first thing in `main`.
+/// Makes the process keep the memory it has been given, where the C library is glibc; elsewhere it does nothing. glibc's allocator hands
+/// the upper end of the heap back whenever 128 KiB of it are free, and gets it again from the kernel page by page: several page faults a
+/// tick. At most 64 MiB are kept free so. It holds for the whole process and does no harm twice: for a program that runs ticks, first
+/// thing in `main`.
 pub fn keep_memory() {
     #[cfg(all(target_os = "linux", target_env = "gnu"))]
     for (parameter, bytes) in [(libc::M_TRIM_THRESHOLD, KEPT_FREE), (libc::M_MMAP_THRESHOLD, MAPPED_ALONE)] {

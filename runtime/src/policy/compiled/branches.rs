@@ -1,8 +1,8 @@
 //! The posteriors of the two branches: one after the other, or side by side on two threads.
 //!
 //! The helper has the environment's, on memory of its own. If it is late, for whatever reason the machine has, the caller does not wait: it
-//! runs the environment's itself on a spare and goes on with what that gives, which is the same to the last bit. A tick is then about as long as on one
-//! thread, however long the helper is gone.
+//! runs the environment's itself on a spare and goes on with what that gives, which is the same to the last bit. A tick is then about as
+//! long as on one thread, however long the helper is gone.
 
 use std::sync::atomic::{AtomicU64, Ordering};
 use std::sync::{Arc, Mutex, MutexGuard, PoisonError, TryLockError};
@@ -261,6 +261,13 @@ mod tests {
         values.fill("image", &[number; LEN]).unwrap();
     }
 
+    /// The helper is sent with an image, and done with it.
+    fn ask(beside: &mut Beside, values: &mut Values, number: f32) {
+        show(values, number);
+        beside.send(values);
+        beside.wait(Duration::from_secs(60));
+    }
+
     #[test]
     fn both_branches_see_each_image() {
         let (mut beside, mut values) = beside();
@@ -278,9 +285,7 @@ mod tests {
     #[test]
     fn what_a_helper_brings_from_an_earlier_image_is_not_taken() {
         let (mut beside, mut values) = beside();
-        show(&mut values, 1.0);
-        beside.send(&values);
-        beside.wait(Duration::from_secs(60));
+        ask(&mut beside, &mut values, 1.0);
         let lane = Arc::clone(&beside.lane);
         // As if the helper were still at it when the next image comes, and done a moment later.
         let still_at_it = lane.work.lock().unwrap();
@@ -293,18 +298,14 @@ mod tests {
         assert_eq!(first(beside.take_over(&values, &mut clock)), -2.0);
         assert!(clock.helper_late);
         // And it goes on.
-        show(&mut values, 3.0);
-        beside.send(&values);
-        beside.wait(Duration::from_secs(60));
+        ask(&mut beside, &mut values, 3.0);
         assert_eq!(first(beside.brought().unwrap()), -3.0);
     }
 
     #[test]
     fn the_spare_gives_way_to_a_helper_that_comes_back() {
         let (mut beside, mut values) = beside();
-        show(&mut values, 4.0);
-        beside.send(&values);
-        beside.wait(Duration::from_secs(60));
+        ask(&mut beside, &mut values, 4.0);
         let inputs = beside.spare.inputs(&values);
         assert!(beside.spare.run_unless(|| true, inputs).unwrap().is_none());
         assert_eq!(first(beside.take_over(&values, &mut StageClock::start())), -4.0);
