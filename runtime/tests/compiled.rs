@@ -156,7 +156,7 @@ fn a_second_thread_that_is_late_is_done_without_and_changes_no_bit() {
 /// Gives the ticks' second threads the core of the calling thread, and of that a tenth, so that they are stopped half-way, or with
 /// SCHED_IDLE hardly anything; or all the cores that there are for this process.
 fn starve_helpers(starve: bool, policy: i32, all: &CpuSet) {
-    let mut cpus = all.clone();
+    let mut cpus = *all;
     if starve {
         cpus.clear();
         cpus.set(sched_getcpu());
