@@ -26,6 +26,7 @@ pub mod checkpoint;
 pub mod cloning;
 pub mod evaluation;
 pub mod export;
+pub mod gpu;
 pub mod learning;
 pub mod model;
 pub mod ops;

@@ -44,6 +44,9 @@ pub enum LearningError {
     /// The model could not be built on the parameters.
     #[error(transparent)]
     Parameters(#[from] ParameterError),
+    /// The GPU did not do what it was asked.
+    #[error(transparent)]
+    Gpu(#[from] rcwm_gpu::GpuError),
     /// A parameter that is to be trained is not connected with the loss.
     #[error("no gradient reaches parameter {name}, which is to be trained: an operation on its way has none")]
     NoGradient {

@@ -1,0 +1,130 @@
+// One source, two compilers. NVRTC reads it as CUDA; a C compiler reads it with one thread a block, block after block, so that the
+// arithmetic, the indices and the order of every kernel are tested where there is no GPU.
+//
+// A kernel works on rows by teams: a team is a warp, or a whole block where rows are few and wide (`wide`). On the host a team is one thread.
+#ifndef RCWM_COMMON_H
+#define RCWM_COMMON_H
+
+// Arguments of every kernel: addresses, counts and factors, in the order that the kernel's comment names.
+typedef struct {
+    void *p[16];
+    long n[16];
+    float f[8];
+} Args;
+
+typedef unsigned int u32;
+typedef unsigned char u8;
+
+#ifdef __CUDACC__
+#define KERNEL(name) extern "C" __global__ void name(Args a)
+#define DEVICE static __device__ __forceinline__
+#define BLOCK ((long)blockIdx.x)
+#define BLOCKS ((long)gridDim.x)
+#define THREAD ((int)threadIdx.x)
+#define THREADS ((int)blockDim.x)
+#define LANES 32
+#define SYNC() __syncthreads()
+#define SHARED(name) extern __shared__ float name[]
+#define NOT_FINITE __int_as_float(0x7fc00000)
+#else
+#include <math.h>
+#define KERNEL(name) void name(Args a, long BLOCK, long BLOCKS)
+#define DEVICE static inline
+#define THREAD 0
+#define THREADS 1
+#define LANES 1
+#define SYNC()
+#define SHARED(name) static float name[1 << 17]
+#define NOT_FINITE NAN
+#endif
+
+#define LANE (THREAD % LANES)
+#define WARP (THREAD / LANES)
+#define WARPS (THREADS / LANES)
+#define FOR_ALL(i, count) for (long i = BLOCK * THREADS + THREAD; i < (count); i += BLOCKS * THREADS)
+
+typedef struct {
+    long first, step;  // rows of this team
+    int lane, lanes;   // this thread in it
+    int wide;
+} Team;
+
+#ifdef __CUDACC__
+DEVICE Team team(long wide) {
+    Team t;
+    t.wide = (int)wide;
+    t.first = wide ? BLOCK : BLOCK * WARPS + WARP;
+    t.step = wide ? BLOCKS : BLOCKS * WARPS;
+    t.lane = wide ? THREAD : LANE;
+    t.lanes = wide ? THREADS : LANES;
+    return t;
+}
+
+DEVICE float warp_sum(float x) {
+    for (int o = 16; o > 0; o /= 2) x += __shfl_xor_sync(0xffffffffu, x, o);
+    return x;
+}
+
+// The sum over a block, for every thread of it.
+DEVICE float block_sum(float x) {
+    __shared__ float sums[32];
+    x = warp_sum(x);
+    __syncthreads();
+    if (LANE == 0) sums[WARP] = x;
+    __syncthreads();
+    return warp_sum(LANE < WARPS ? sums[LANE] : 0.0f);
+}
+
+DEVICE float team_sum(Team t, float x) { return t.wide ? block_sum(x) : warp_sum(x); }
+
+DEVICE float warp_max(float x) {
+    for (int o = 16; o > 0; o /= 2) x = fmaxf(x, __shfl_xor_sync(0xffffffffu, x, o));
+    return x;
+}
+
+// The index of the largest value of a warp; of equals the smallest index.
+DEVICE int warp_best(float x, int index) {
+    for (int o = 16; o > 0; o /= 2) {
+        float other = __shfl_xor_sync(0xffffffffu, x, o);
+        int other_index = __shfl_xor_sync(0xffffffffu, index, o);
+        if (other > x || (other == x && other_index < index)) {
+            x = other;
+            index = other_index;
+        }
+    }
+    return index;
+}
+
+// The sum over the warps of a block of what the threads of one lane hold, for the first warp.
+DEVICE float across_warps(float x) {
+    __shared__ float sums[32][33];
+    __syncthreads();
+    sums[WARP][LANE] = x;
+    __syncthreads();
+    float sum = 0.0f;
+    if (WARP == 0)
+        for (int w = 0; w < WARPS; w++) sum += sums[w][LANE];
+    return sum;
+}
+#else
+static inline Team team_of(long BLOCK, long BLOCKS) {
+    Team t = {BLOCK, BLOCKS, 0, 1, 0};
+    return t;
+}
+#define team(wide) team_of(BLOCK, BLOCKS)
+#define warp_sum(x) (x)
+#define block_sum(x) (x)
+#define team_sum(t, x) (x)
+#define warp_max(x) (x)
+#define warp_best(x, index) (index)
+#define across_warps(x) (x)
+#endif
+
+DEVICE float sigmoid_of(float x) { return 0.5f * tanhf(0.5f * x) + 0.5f; }
+DEVICE float symlog_of(float x) { return x < 0.0f ? -log1pf(-x) : log1pf(x); }
+DEVICE float symexp_of(float x) { return x < 0.0f ? -expm1f(-x) : expm1f(x); }
+
+// What an output becomes: `found`, added to what is there where `add` says so.
+DEVICE void put(float *at, long add, float found) { *at = add ? *at + found : found; }
+
+#endif

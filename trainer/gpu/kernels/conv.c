@@ -1,0 +1,116 @@
+#include "common.h"
+
+// Convolutions of kernel 4, stride 2, padding 1 on maps [images, side, side, channels], as one matrix product with their windows.
+
+// Windows [images (side/2)^2, 16 channels], (row, column, channel) of the kernel in this order. p: x, windows. n: images, side, channels.
+// Counts must stay below 2^32: long batches are done in parts.
+KERNEL(windows) {
+    const float *x = (const float *)a.p[0];
+    float *y = (float *)a.p[1];
+    u32 side = (u32)a.n[1], half = side / 2, channels = (u32)a.n[2], width = 16 * channels;
+    FOR_ALL(at, a.n[0] * half * half * width) {
+        u32 i = (u32)at, k = i % width, place = i / width, c = k % channels, tap = k / channels;
+        u32 column = 2 * (place % half) + tap % 4, row = 2 * (place / half % half) + tap / 4;
+        float value = 0.0f;
+        if (row >= 1 && row <= side && column >= 1 && column <= side)
+            value = x[(((long)(place / (half * half)) * side + row - 1) * side + column - 1) * channels + c];
+        y[i] = value;
+    }
+}
+
+// The sum of windows over the places they were cut from: x [images, side, side, channels] of windows of its half-sized map.
+// p: windows, x, bias [channels] or null. n: images, side, channels, add.
+KERNEL(from_windows) {
+    const float *windows = (const float *)a.p[0], *bias = (const float *)a.p[2];
+    float *x = (float *)a.p[1];
+    u32 side = (u32)a.n[1], half = side / 2, channels = (u32)a.n[2], width = 16 * channels;
+    FOR_ALL(at, a.n[0] * side * side * channels) {
+        u32 i = (u32)at, c = i % channels, place = i / channels, column = place % side, row = place / side % side;
+        u32 image = place / (side * side);
+        float sum = bias ? bias[c] : 0.0f;
+        // Of each four kernel rows two fall on this row: 2 p + tap - 1 = row.
+        for (u32 ty = (row + 1) % 2; ty < 4; ty += 2) {
+            u32 py = (row + 1 - ty) / 2;
+            if (row + 1 < ty || py >= half) continue;
+            for (u32 tx = (column + 1) % 2; tx < 4; tx += 2) {
+                u32 px = (column + 1 - tx) / 2;
+                if (column + 1 < tx || px >= half) continue;
+                sum += windows[((long)(image * half + py) * half + px) * width + (ty * 4 + tx) * channels + c];
+            }
+        }
+        put(x + i, a.n[3], sum);
+    }
+}
+
+// Images of a store of u8 [.., 64, 64, 3] by index, shifted by row of the batch, as x / 255 - 0.5.
+// p: store, index (u32) [count], shift (int: right, down) [B, 2] or null, out. n: count, B, channels.
+// Where n[3] a mask is copied: u8 to u8.
+KERNEL(gather_images) {
+    const u8 *store = (const u8 *)a.p[0];
+    const u32 *index = (const u32 *)a.p[1];
+    const int *shift = (const int *)a.p[2];
+    u32 channels = (u32)a.n[2], pixels = 64 * 64 * channels;
+    FOR_ALL(i, a.n[0] * pixels) {
+        u32 image = (u32)(i / pixels), at = (u32)(i % pixels), c = at % channels;
+        int column = (int)(at / channels % 64), row = (int)(at / channels / 64);
+        if (shift) {
+            const int *by = shift + 2 * (image % a.n[1]);
+            column -= by[0];
+            row -= by[1];
+            column = column < 0 ? 0 : column > 63 ? 63 : column;
+            row = row < 0 ? 0 : row > 63 ? 63 : row;
+        }
+        u8 value = store[(long)index[image] * pixels + ((u32)row * 64 + (u32)column) * channels + c];
+        if (a.n[3]) ((u8 *)a.p[3])[i] = value;
+        else ((float *)a.p[3])[i] = (float)value / 255.0f - 0.5f;
+    }
+}
+
+// Squared error of the picture (eq. 8, 9) and of the robot's mask, with gradients, an image a block.
+// p: raw robot [count, 64, 64, 4], raw environment (or null: one branch), image (float), mask (u8, or null), row (u32 [count]: which image; or
+// null), loss [count], mask loss [count], d robot, d environment. n: count. f: weight, mask weight.
+KERNEL(picture_loss) {
+    const float *raw[2] = {(const float *)a.p[0], (const float *)a.p[1]}, *image = (const float *)a.p[2];
+    const u8 *mask = (const u8 *)a.p[3];
+    const u32 *rows = (const u32 *)a.p[4];
+    float *d[2] = {(float *)a.p[7], (float *)a.p[8]};
+    for (long at = BLOCK; at < a.n[0]; at += BLOCKS) {
+        long source = (rows ? (long)rows[at] : at) * 4096;
+        float loss = 0.0f, mask_loss = 0.0f;
+        for (long i = THREAD; i < 4096; i += THREADS) {
+            const float *x = raw[0] + 4 * (at * 4096 + i), *truth = image + 3 * (source + i);
+            float *dx = d[0] + 4 * (at * 4096 + i), alpha = sigmoid_of(x[3]), d_alpha = 0.0f;
+            if (raw[1]) {
+                const float *y = raw[1] + 4 * (at * 4096 + i);
+                float *dy = d[1] + 4 * (at * 4096 + i), beta = sigmoid_of(y[3]), d_beta = 0.0f;
+                for (int c = 0; c < 3; c++) {
+                    float error = x[c] * alpha + y[c] * beta - truth[c], g = 2.0f * a.f[0] * error;
+                    loss += error * error;
+                    dx[c] = g * alpha;
+                    dy[c] = g * beta;
+                    d_alpha += g * x[c];
+                    d_beta += g * y[c];
+                }
+                dy[3] = d_beta * beta * (1.0f - beta);
+            } else {
+                for (int c = 0; c < 3; c++) {
+                    float error = x[c] - truth[c];
+                    loss += error * error;
+                    dx[c] = 2.0f * a.f[0] * error;
+                }
+            }
+            if (mask) {
+                float error = alpha - (float)mask[source + i];
+                mask_loss += error * error;
+                d_alpha += 2.0f * a.f[1] * error;
+            }
+            dx[3] = d_alpha * alpha * (1.0f - alpha);
+        }
+        loss = block_sum(loss);
+        mask_loss = block_sum(mask_loss);
+        if (THREAD == 0) {
+            ((float *)a.p[5])[at] = loss;
+            if (mask) ((float *)a.p[6])[at] = mask_loss;
+        }
+    }
+}

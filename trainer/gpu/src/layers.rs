@@ -1,0 +1,532 @@
+//! The model's layers on a tape. Forward of an op and the way back stand together; gradients of weights are collected apart from it, so that a
+//! scan over time has one product a weight and not one a step: what collects is added before the scan and so runs after it backward.
+
+use crate::machine::Kernel;
+use crate::program::{Grid, Matrix, Pointer};
+use crate::tape::{Tape, chunks_of};
+use crate::weights::{Array, Weights};
+
+/// LayerNorm's epsilon everywhere but in the interaction model.
+const NORM_EPS: f32 = 1e-3;
+/// LayerNorm's epsilon in the interaction model.
+const INTERACTION_NORM_EPS: f32 = 1e-5;
+/// Images whose windows are made at a time: their number must stay below 2^32, and they take 0.5 MB an image.
+const IMAGES_AT_A_TIME: usize = 1024;
+
+/// A parameter, with its gradient where it is trained.
+#[derive(Debug, Clone, Copy)]
+pub struct Weight {
+    /// Its numbers.
+    pub value: Matrix,
+    /// Where its gradient is added up.
+    pub gradient: Option<Matrix>,
+}
+
+impl Weight {
+    /// Some of its columns.
+    #[must_use]
+    pub fn columns(self, columns: std::ops::Range<usize>) -> Self {
+        let cut = |matrix: Matrix| matrix.columns(columns.clone());
+        Self { value: cut(self.value), gradient: self.gradient.map(cut) }
+    }
+}
+
+/// Gain and shift of a LayerNorm.
+#[derive(Debug, Clone, Copy)]
+pub struct Norm {
+    gain: Weight,
+    shift: Weight,
+    eps: f32,
+}
+
+/// A linear layer with bias.
+#[derive(Debug, Clone, Copy)]
+pub struct Linear {
+    /// [out, in].
+    pub weight: Weight,
+    /// [out].
+    pub bias: Weight,
+}
+
+/// A dense block: linear without bias, LayerNorm, `SiLU`.
+#[derive(Debug, Clone, Copy)]
+pub struct Dense {
+    /// [out, in].
+    pub weight: Weight,
+    /// Of width out.
+    pub norm: Norm,
+}
+
+/// Two dense blocks and an output layer.
+#[derive(Debug, Clone, Copy)]
+pub struct Mlp {
+    blocks: [Dense; 2],
+    out: Linear,
+}
+
+impl Mlp {
+    /// The dense blocks.
+    #[must_use]
+    pub fn blocks(&self) -> [Dense; 2] {
+        self.blocks
+    }
+
+    /// The output layer.
+    #[must_use]
+    pub fn out(&self) -> Linear {
+        self.out
+    }
+}
+
+/// Robot to environment.
+#[derive(Debug, Clone, Copy)]
+pub struct Interaction {
+    /// h to k rows.
+    pub deter: Linear,
+    query: Linear,
+    key: Linear,
+    value: Linear,
+    output: Linear,
+    norm: Norm,
+}
+
+/// Parameters by name; those that `trains` accepts have gradients.
+#[derive(Clone, Copy)]
+pub struct Source<'a> {
+    /// The arrays.
+    pub weights: &'a Weights,
+    /// Which are trained.
+    pub trains: fn(&str) -> bool,
+}
+
+impl Source<'_> {
+    /// The parameter of this name.
+    #[must_use]
+    pub fn weight(&self, name: &str) -> Weight {
+        let gradient = (self.trains)(name).then(|| self.weights.matrix(Array::Gradients, name));
+        Weight { value: self.weights.matrix(Array::Values, name), gradient }
+    }
+
+    /// `NAME.weight` and `NAME.bias` of a norm.
+    #[must_use]
+    pub fn norm(&self, name: &str) -> Norm {
+        let [gain, shift] = ["weight", "bias"].map(|part| self.weight(&format!("{name}.{part}")));
+        Norm { gain, shift, eps: NORM_EPS }
+    }
+
+    /// `NAME.weight` and `NAME.bias` of a linear layer.
+    #[must_use]
+    pub fn linear(&self, name: &str) -> Linear {
+        let [weight, bias] = ["weight", "bias"].map(|part| self.weight(&format!("{name}.{part}")));
+        Linear { weight, bias }
+    }
+
+    /// `NAME.linear.weight` and `NAME.norm`.
+    #[must_use]
+    pub fn dense(&self, name: &str) -> Dense {
+        Dense { weight: self.weight(&format!("{name}.linear.weight")), norm: self.norm(&format!("{name}.norm")) }
+    }
+
+    /// `NAME.0`, `NAME.1`, `NAME.out`.
+    #[must_use]
+    pub fn mlp(&self, name: &str) -> Mlp {
+        let blocks = [0, 1].map(|block| self.dense(&format!("{name}.{block}")));
+        Mlp { blocks, out: self.linear(&format!("{name}.out")) }
+    }
+
+    /// `interaction.*`.
+    #[must_use]
+    pub fn interaction(&self) -> Interaction {
+        let linear = |part: &str| self.linear(&format!("interaction.{part}"));
+        let norm = Norm { eps: INTERACTION_NORM_EPS, ..self.norm("interaction.norm") };
+        let (query, key, value) = (linear("query"), linear("key"), linear("value"));
+        Interaction { deter: linear("deter"), query, key, value, output: linear("output"), norm }
+    }
+}
+
+/// Means and scales of a norm's rows, which the way back needs.
+fn stats_of(tape: &mut Tape, rows: usize) -> Matrix {
+    tape.matrix(rows, 2)
+}
+
+impl Tape {
+    /// `y = x w^T`, or added to y.
+    pub fn linear(&mut self, x: Matrix, weight: Weight, y: Matrix, add: bool) {
+        self.product((x, false), (weight.value, true), y, add);
+    }
+
+    /// The way back of [`Tape::linear`] to x.
+    pub fn linear_back(&mut self, x: Matrix, weight: Weight, y: Matrix) {
+        self.on_backward(move |tape| {
+            let dy = tape.gradient_of(y);
+            let (dx, add) = tape.gradient_term(x);
+            tape.product((dy, false), (weight.value, false), dx, add);
+        });
+    }
+
+    /// Collects the weight's gradient over all rows.
+    pub fn collect_linear(&mut self, x: Matrix, weight: Weight, y: Matrix) {
+        let Some(gradient) = weight.gradient else { return };
+        self.on_backward(move |tape| {
+            let dy = tape.gradient_of(y);
+            tape.product((dy, true), (x, false), gradient, true);
+        });
+    }
+
+    /// Every row of y becomes the bias, to which a product is then added; collects the bias's gradient.
+    pub fn fill_bias(&mut self, bias: Weight, y: Matrix) {
+        let n = [y.rows, y.cols, y.stride];
+        self.program.kernel(Kernel::FillRows, Grid::elements(y.len()), &[bias.value.into(), y.into()], &n, &[]);
+        let Some(gradient) = bias.gradient else { return };
+        self.on_backward(move |tape| {
+            let dy = tape.gradient_of(y);
+            tape.add_column_sums(dy, gradient);
+        });
+    }
+
+    /// A linear layer with bias, all at once: y; `reaches` says whether the gradient goes on to x.
+    pub fn layer(&mut self, x: Matrix, layer: Linear, reaches: bool) -> Matrix {
+        let y = self.matrix(x.rows, layer.weight.value.rows);
+        self.fill_bias(layer.bias, y);
+        self.collect_linear(x, layer.weight, y);
+        self.linear(x, layer.weight, y, true);
+        if reaches {
+            self.linear_back(x, layer.weight, y);
+        }
+        y
+    }
+
+    /// A dense block, all at once.
+    pub fn dense(&mut self, x: Matrix, block: Dense, reaches: bool) -> Matrix {
+        let pre = self.matrix(x.rows, block.weight.value.rows);
+        self.collect_linear(x, block.weight, pre);
+        self.linear(x, block.weight, pre, false);
+        if reaches {
+            self.linear_back(x, block.weight, pre);
+        }
+        let y = self.matrix(pre.rows, pre.cols);
+        self.norm(pre, block.norm, y, true);
+        y
+    }
+
+    /// Two dense blocks and an output layer.
+    pub fn mlp(&mut self, x: Matrix, mlp: &Mlp, reaches: bool) -> Matrix {
+        let inner = self.dense(x, mlp.blocks[0], reaches);
+        let inner = self.dense(inner, mlp.blocks[1], true);
+        self.layer(inner, mlp.out, true)
+    }
+
+    /// LayerNorm of rows, then `SiLU` where `silu`, all at once.
+    pub fn norm(&mut self, x: Matrix, norm: Norm, y: Matrix, silu: bool) {
+        let stats = stats_of(self, x.rows);
+        self.collect_norm(x, norm, stats, y, silu);
+        self.norm_step(x, norm, stats, y, silu);
+    }
+
+    /// The same of some of the rows, whose gain and shift are collected apart.
+    pub fn norm_step(&mut self, x: Matrix, norm: Norm, stats: Matrix, y: Matrix, silu: bool) {
+        let (grid, wide) = Grid::rows(x.rows, x.cols);
+        let p = [x.into(), norm.gain.value.into(), norm.shift.value.into(), y.into(), stats.into()];
+        let n = [x.rows, x.cols, x.stride, y.stride, usize::from(silu), usize::from(wide)];
+        self.program.kernel(Kernel::NormForward, grid, &p, &n, &[norm.eps]);
+        self.on_backward(move |tape| {
+            let dy = tape.gradient_of(y);
+            let (dx, add) = tape.gradient_term(x);
+            let p = [x, norm.gain.value, norm.shift.value, stats, dy, dx].map(Pointer::from);
+            let flags = [usize::from(silu), usize::from(add), usize::from(wide)];
+            let n = [&[x.rows, x.cols, x.stride, dy.stride, dx.stride][..], &flags].concat();
+            tape.program.kernel(Kernel::NormBackward, grid, &p, &n, &[]);
+        });
+    }
+
+    /// Collects the gradients of gain and shift over all rows.
+    pub fn collect_norm(&mut self, x: Matrix, norm: Norm, stats: Matrix, y: Matrix, silu: bool) {
+        self.on_backward(move |tape| {
+            if norm.gain.gradient.is_some() {
+                let dy = tape.gradient_of(y);
+                tape.add_norm_gradients(x, norm, stats, dy, silu);
+            }
+        });
+    }
+
+    fn add_norm_gradients(&mut self, x: Matrix, norm: Norm, stats: Matrix, dy: Matrix, silu: bool) {
+        let (Some(gain), Some(shift)) = (norm.gain.gradient, norm.shift.gradient) else { return };
+        let (chunks, rows) = chunks_of(x.rows);
+        let partial = self.matrix(chunks * 2, x.cols);
+        let p = [x, norm.gain.value, norm.shift.value, stats, dy, partial].map(Pointer::from);
+        let n = [x.rows, x.cols, x.stride, dy.stride, usize::from(silu), rows];
+        let grid = Grid { blocks: chunks * x.cols.div_ceil(32), threads: 256, shared_bytes: 0 };
+        self.program.kernel(Kernel::NormParameters, grid, &p, &n, &[]);
+        self.add_partials(partial.pointer(), gain, chunks, 2 * x.cols, 0);
+        self.add_partials(partial.pointer(), shift, chunks, 2 * x.cols, x.cols);
+    }
+
+    /// The recurrent cell of some of the rows: h' from its layer's output `pre` [rows, 3d] and h. `gates` [rows, 3d] takes the gradients after
+    /// the norm.
+    pub fn cell_step(&mut self, pre: Matrix, norm: Norm, stats: Matrix, gates: Matrix, h: Matrix, next: Matrix) {
+        let (grid, wide) = Grid::rows(pre.rows, pre.cols);
+        let p = [pre, norm.gain.value, norm.shift.value, h, next, stats].map(Pointer::from);
+        let n = [pre.rows, h.cols, pre.stride, h.stride, next.stride, usize::from(wide)];
+        self.program.kernel(Kernel::CellForward, grid, &p, &n, &[norm.eps]);
+        self.on_backward(move |tape| {
+            let d_next = tape.gradient_of(next);
+            let d_pre = tape.gradient_overwritten(pre);
+            let dh = tape.gradient_sum(h);
+            let p = [pre, norm.gain.value, norm.shift.value, h, stats, d_next, gates, d_pre, dh].map(Pointer::from);
+            let n = [pre.rows, h.cols, pre.stride, h.stride, d_next.stride, dh.stride, usize::from(wide)];
+            tape.program.kernel(Kernel::CellBackward, grid, &p, &n, &[]);
+        });
+    }
+
+    /// Collects the gradients of the cell's gain and shift over all rows.
+    pub fn collect_cell(&mut self, pre: Matrix, norm: Norm, stats: Matrix, gates: Matrix) {
+        self.on_backward(move |tape| tape.add_norm_gradients(pre, norm, stats, gates, false));
+    }
+
+    /// One-hot draws z [rows, n m] from logits [rows, n m], with a straight-through gradient. `noise` are Gumbel numbers (none: the mode); its
+    /// row b * T + t belongs to row t * B + b where `major` is (T, B).
+    pub fn draw(&mut self, logits: Matrix, noise: Option<Matrix>, z: Matrix, draw: Draw) {
+        let Draw { classes, unimix, major } = draw;
+        let (n, mode) = (logits.cols / classes, noise.is_none());
+        let (t, b) = major.unwrap_or((0, 1));
+        let grid = Grid::warps(logits.rows * n);
+        let counts = [logits.rows, n, classes, logits.stride, z.stride, t, b];
+        self.program.kernel(Kernel::Draw, grid, &[logits.into(), noise.into(), z.into()], &counts, &[unimix]);
+        self.on_backward(move |tape| {
+            let dz = tape.gradient_of(z);
+            let (dx, add) = tape.gradient_term(logits);
+            let n = [&[logits.rows, n, classes, logits.stride, dz.stride, dx.stride][..], &[
+                usize::from(mode),
+                usize::from(add),
+            ]];
+            let p = [logits, dz, dx].map(Pointer::from);
+            tape.program.kernel(Kernel::DrawBackward, grid, &p, &n.concat(), &[unimix]);
+        });
+    }
+
+    /// The state that some rows carry: `initial` where `first` is set, else `carried`; all `initial` without `carried`.
+    pub fn carry(&mut self, first: Matrix, initial: Matrix, carried: Option<Matrix>, y: Matrix) {
+        let n = [y.rows, y.cols, carried.map_or(0, |m| m.stride), y.stride];
+        let p = [first.into(), initial.into(), carried.into(), y.into()];
+        self.program.kernel(Kernel::Carry, Grid::elements(y.len()), &p, &n, &[]);
+        self.on_backward(move |tape| {
+            let dy = tape.gradient_of(y);
+            let d_initial = tape.gradient_sum(initial);
+            let d_carried = carried.map(|carried| tape.gradient_sum(carried));
+            let n = [y.rows, y.cols, d_carried.map_or(0, |m| m.stride), dy.stride];
+            let p = [first.into(), d_initial.into(), d_carried.into(), dy.into()];
+            let grid = Grid { blocks: y.cols.div_ceil(64), threads: 64, shared_bytes: 0 };
+            tape.program.kernel(Kernel::CarryBackward, grid, &p, &n, &[]);
+        });
+    }
+
+    /// y = x, with a gradient.
+    pub fn copied(&mut self, x: Matrix, y: Matrix) {
+        self.copy(x, y, false, 1.0);
+        self.on_backward(move |tape| {
+            let dy = tape.gradient_of(y);
+            let (dx, add) = tape.gradient_term(x);
+            tape.copy(dy, dx, add, 1.0);
+        });
+    }
+
+    /// y = tanh(x) of a parameter [1, width].
+    pub fn tanh(&mut self, x: Weight) -> Matrix {
+        let y = self.matrix(1, x.value.cols);
+        let n = [y.len(), 0];
+        self.program.kernel(Kernel::Tanh, Grid::elements(y.len()), &[x.value.into(), y.into()], &n, &[]);
+        if let Some(dx) = x.gradient {
+            self.on_backward(move |tape| {
+                let dy = tape.gradient_of(y);
+                let p = [y, dy, dx].map(Pointer::from);
+                tape.program.kernel(Kernel::Tanh, Grid::elements(y.len()), &p, &[y.len(), 1], &[]);
+            });
+        }
+        y
+    }
+
+    /// The interaction of some rows: e [rows, n m] from z [rows, n m] and u [rows, (n+k) m].
+    pub fn interaction_step(&mut self, parts: &Interaction, classes: usize, at: Attending) {
+        let Attending { z, u, e, mix, sum, stats, store } = at;
+        let (m, parts) = (classes, *parts);
+        let (n, r) = (z.cols / m, u.cols / m);
+        let layers = [parts.query, parts.key, parts.value, parts.output];
+        let weights: Vec<Pointer> =
+            layers.iter().flat_map(|l| [l.weight.value.into(), l.bias.value.into()]).collect();
+        let floats = 4 * m * (m + 1) + (3 * n + 3 * r) * (m + 1) + n * (r + 1);
+        let grid = Grid { blocks: z.rows, threads: 256, shared_bytes: 4 * floats };
+        let norm = [parts.norm.gain.value, parts.norm.shift.value, e].map(Pointer::from);
+        let p = [&[z.into(), u.into()][..], &weights, &norm, &[mix.into(), sum.into(), stats.into()]].concat();
+        let counts = [z.rows, n, r, m, z.stride, u.stride, e.stride];
+        self.program.kernel(Kernel::InteractionForward, grid, &p, &counts, &[parts.norm.eps]);
+        self.on_backward(move |tape| {
+            let de = tape.gradient_of(e);
+            let dz = tape.gradient_sum(z);
+            let du = tape.gradient_overwritten(u);
+            let floats = floats + (3 * n + 2 * r) * (m + 1) + n * (r + 1);
+            let grid = Grid { shared_bytes: 4 * floats, ..grid };
+            let gradients = [parts.norm.gain.value, stats, de, dz, du].map(Pointer::from);
+            let bias = parts.output.bias.value.into();
+            let store_at = store.map_or(Pointer::NULL, |store| store.at.pointer());
+            let p = [&[z.into(), u.into()][..], &weights[..7], &gradients, &[store_at, bias]].concat();
+            let distances = store.map_or([0; 3], |store| store.distances);
+            let n =
+                [&[z.rows, n, r, m, z.stride, u.stride, de.stride, dz.stride, du.stride][..], &distances].concat();
+            tape.program.kernel(Kernel::InteractionBackward, grid, &p, &n, &[]);
+        });
+    }
+
+    /// Collects the gradients of the interaction's weights but `deter`'s over all rows.
+    pub fn collect_interaction(&mut self, parts: &Interaction, classes: usize, all: Attending) {
+        let (parts, m) = (*parts, classes);
+        let (Some(mix), Some(sum), Some(store)) = (all.mix, all.sum, all.store) else { return };
+        self.on_backward(move |tape| {
+            let (rows, n, r) = (all.z.rows, all.z.cols / m, all.u.cols / m);
+            let at = |distance: usize, rows: usize| Matrix {
+                offset: store.at.offset + distance,
+                rows,
+                cols: m,
+                stride: m,
+                ..store.at
+            };
+            let [q, k, v] = store.distances;
+            let flat = |x: Matrix| x.reshape(x.len() / m, m);
+            let (z, u) = (flat(all.z), flat(all.u));
+            let pairs = [
+                (parts.output, at(0, rows * n), flat(mix)),
+                (parts.query, at(q, rows * n), z),
+                (parts.key, at(k, rows * r), u),
+                (parts.value, at(v, rows * r), u),
+            ];
+            for (layer, d, x) in pairs {
+                let (Some(weight), Some(bias)) = (layer.weight.gradient, layer.bias.gradient) else { continue };
+                tape.product((d, true), (x, false), weight, true);
+                tape.add_column_sums(d, bias);
+            }
+            let de = tape.gradient_of(all.e);
+            tape.add_norm_gradients(flat(sum), parts.norm, all.stats, flat(de), false);
+        });
+    }
+
+    /// A convolution that halves the sides of x [images side side, channels], with norm and `SiLU`; `reaches` as in [`Tape::layer`].
+    pub fn conv_down(&mut self, x: Matrix, side: usize, weight: Weight, norm: Norm, reaches: bool) -> Matrix {
+        let (channels, out, half) = (x.cols, weight.value.rows, side / 2);
+        let images = x.rows / (side * side);
+        let pre = self.matrix(images * half * half, out);
+        for chunk in chunks(images) {
+            let windows = self.windows_of(x, side, &chunk);
+            let y = pre.rows(chunk.start * half * half..chunk.end * half * half);
+            self.product((windows, false), (weight.value, true), y, false);
+        }
+        self.on_backward(move |tape| {
+            let d_pre = tape.gradient_of(pre);
+            let dx = reaches.then(|| tape.gradient_term(x));
+            for chunk in chunks(images) {
+                let dy = d_pre.rows(chunk.start * half * half..chunk.end * half * half);
+                if let Some(gradient) = weight.gradient {
+                    let windows = tape.windows_of(x, side, &chunk);
+                    tape.product((dy, true), (windows, false), gradient, true);
+                }
+                if let Some((dx, add)) = dx {
+                    let d_windows = tape.matrix(dy.rows, 16 * channels);
+                    tape.product((dy, false), (weight.value, false), d_windows, false);
+                    let rows = chunk.start * side * side..chunk.end * side * side;
+                    tape.from_windows(d_windows, dx.rows(rows), side, None, add);
+                }
+            }
+        });
+        let y = self.matrix(pre.rows, out);
+        self.norm(pre, norm, y, true);
+        y
+    }
+
+    /// A transposed convolution that doubles the sides of x [images side side, channels]: its sums, before norm and activation.
+    pub fn conv_up(&mut self, x: Matrix, side: usize, weight: Weight, bias: Option<Weight>) -> Matrix {
+        let (out, twice) = (weight.value.cols / 16, 2 * side);
+        let images = x.rows / (side * side);
+        let y = self.matrix(images * twice * twice, out);
+        let parts = move |chunk: &std::ops::Range<usize>| {
+            (chunk.start * side * side..chunk.end * side * side, chunk.start * twice * twice..chunk.end * twice * twice)
+        };
+        for chunk in chunks(images) {
+            let (small, large) = parts(&chunk);
+            let windows = self.matrix(small.len(), 16 * out);
+            self.product((x.rows(small), false), (weight.value, false), windows, false);
+            self.from_windows(windows, y.rows(large), twice, bias, false);
+        }
+        self.on_backward(move |tape| {
+            let dy = tape.gradient_of(y);
+            let (dx, add) = tape.gradient_term(x);
+            for chunk in chunks(images) {
+                let (small, _) = parts(&chunk);
+                let windows = tape.windows_of(dy, twice, &chunk);
+                if let Some(gradient) = weight.gradient {
+                    tape.product((x.rows(small.clone()), true), (windows, false), gradient, true);
+                }
+                tape.product((windows, false), (weight.value, true), dx.rows(small), add);
+            }
+            if let Some(gradient) = bias.and_then(|bias| bias.gradient) {
+                tape.add_column_sums(dy, gradient);
+            }
+        });
+        y
+    }
+
+    fn windows_of(&mut self, x: Matrix, side: usize, images: &std::ops::Range<usize>) -> Matrix {
+        let (channels, half) = (x.cols, side / 2);
+        let windows = self.matrix(images.len() * half * half, 16 * channels);
+        let x = x.rows(images.start * side * side..images.end * side * side);
+        let n = [images.len(), side, channels];
+        self.program.kernel(Kernel::Windows, Grid::elements(windows.len()), &[x.into(), windows.into()], &n, &[]);
+        windows
+    }
+
+    fn from_windows(&mut self, windows: Matrix, x: Matrix, side: usize, bias: Option<Weight>, add: bool) {
+        let p = [windows.into(), x.into(), bias.map(|bias| bias.value).into()];
+        let n = [x.rows / (side * side), side, x.cols, usize::from(add)];
+        self.program.kernel(Kernel::FromWindows, Grid::elements(x.len()), &p, &n, &[]);
+    }
+}
+
+fn chunks(images: usize) -> impl Iterator<Item = std::ops::Range<usize>> {
+    (0..images).step_by(IMAGES_AT_A_TIME).map(move |from| from..(from + IMAGES_AT_A_TIME).min(images))
+}
+
+/// How categoricals are drawn.
+#[derive(Debug, Clone, Copy)]
+pub struct Draw {
+    /// m.
+    pub classes: usize,
+    /// Share of the uniform distribution.
+    pub unimix: f32,
+    /// (T, B) where the noise's rows are those of sequences first.
+    pub major: Option<(usize, usize)>,
+}
+
+/// Rows of the interaction: inputs, output, and what the weights' gradients need.
+#[derive(Debug, Clone, Copy)]
+pub struct Attending {
+    /// Environment's z_{t-1} [rows, n m].
+    pub z: Matrix,
+    /// Robot's prior z_t and k rows of its h_t [rows, (n+k) m].
+    pub u: Matrix,
+    /// Features e_{t-1} [rows, n m].
+    pub e: Matrix,
+    /// Mixtures [rows, n m], where the weights are trained.
+    pub mix: Option<Matrix>,
+    /// Sums before the norm [rows, n m], likewise.
+    pub sum: Option<Matrix>,
+    /// Of the norm [rows n, 2].
+    pub stats: Matrix,
+    /// Gradients inside, likewise.
+    pub store: Option<Store>,
+}
+
+/// Where the interaction's gradients lie for its weights: of the sum before the norm, then q, k and v.
+#[derive(Debug, Clone, Copy)]
+pub struct Store {
+    /// All, with this row's part of the sums first.
+    pub at: Matrix,
+    /// From this row's part of the sums to those of q, k and v, in numbers.
+    pub distances: [usize; 3],
+}

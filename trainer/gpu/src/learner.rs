@@ -1,0 +1,630 @@
+//! World model, actor and critic on one machine: weights, optimisers, and the programs that update them.
+
+use crate::behaviour::{self, BehaviourScales, Sources};
+use crate::layers::Source;
+use crate::machine::{GpuError, Kernel, Machine, PartTime, Ready};
+use crate::program::{Arena, Grid, Matrix, Pointer, Program};
+use crate::tape::Tape;
+use crate::weights::{Array, Group, Weights};
+use crate::world::{self, Inputs, Sizes, WorldScales};
+
+/// Adam with clipping by the global norm.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct AdamScales {
+    /// Added to the root of the second moment.
+    pub eps: f32,
+    /// Largest norm of all gradients together.
+    pub clip_norm: f32,
+    /// Decay of the first moment.
+    pub beta1: f64,
+    /// Decay of the second moment.
+    pub beta2: f64,
+}
+
+/// What a learner does.
+#[derive(Debug, Clone)]
+pub struct LearnerSettings {
+    /// Sizes of batch and model.
+    pub sizes: Sizes,
+    /// The world model's losses.
+    pub world: WorldScales,
+    /// The world model's optimiser.
+    pub world_adam: AdamScales,
+    /// Actor and critic, where they learn, with their optimisers.
+    pub behaviour: Option<(BehaviourScales, AdamScales, AdamScales)>,
+    /// Decay of the running average of the world model's weights; 0: none is kept.
+    pub average_decay: f64,
+    /// Images that are kept on the machine, from which batches are gathered; 0: every batch brings its own.
+    pub stored_images: usize,
+    /// Whether the stored images have masks beside them.
+    pub stored_masks: bool,
+}
+
+/// A batch as the trainer draws it: sequences first, then steps.
+#[derive(Debug, Clone, Copy)]
+pub struct Batch<'a> {
+    /// Its images.
+    pub images: Images<'a>,
+    /// [B, T, action].
+    pub action: &'a [f32],
+    /// [B, T].
+    pub reward: &'a [f32],
+    /// [B, T].
+    pub terminal: &'a [bool],
+    /// [B, T].
+    pub first: &'a [bool],
+    /// Whether masks are used.
+    pub masks: bool,
+    /// Which batch of a run it is: what is painted takes turns by it.
+    pub number: u64,
+    /// By how many pixels each sequence's images move, right and down; empty: none moves.
+    pub shift: &'a [[i32; 2]],
+}
+
+/// Where a batch's images are.
+#[derive(Debug, Clone, Copy)]
+pub enum Images<'a> {
+    /// Here: u8 [B, T, 64, 64, 3], and [B, T, 64, 64] masks where they are used.
+    Host(&'a [u8], &'a [u8]),
+    /// On the machine, by number: [B, T].
+    Stored(&'a [u32]),
+}
+
+/// The generator that noise is drawn from: ChaCha8's key, and its stream.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub struct Noise {
+    /// The seed's 32 bytes.
+    pub key: [u8; 32],
+    /// The update's number.
+    pub stream: u64,
+}
+
+/// What an update of the world model was.
+#[derive(Debug, Clone, Copy, PartialEq, Default)]
+pub struct WorldValues {
+    /// Squared error of the picture.
+    pub image: f64,
+    /// The same of the robot's mask, where masks were used.
+    pub robot_mask: Option<f64>,
+    /// Cross-entropy of the reward.
+    pub reward: f64,
+    /// Cross-entropy of the continuation.
+    pub continues: f64,
+    /// KL of each branch.
+    pub kl: [f64; 2],
+    /// The sum with factors.
+    pub total: f64,
+    /// Norm of the gradients before clipping.
+    pub gradient_norm: f64,
+}
+
+/// What an update of actor and critic was.
+#[derive(Debug, Clone, Copy, PartialEq, Default)]
+pub struct BehaviourValues {
+    /// The actor's loss.
+    pub actor_loss: f64,
+    /// The critic's loss.
+    pub critic_loss: f64,
+    /// Norm of the actor's gradients before clipping.
+    pub actor_gradient_norm: f64,
+    /// Norm of the critic's gradients before clipping.
+    pub critic_gradient_norm: f64,
+    /// Mean entropy of the actor.
+    pub entropy: f64,
+    /// Mean predicted reward.
+    pub reward: f64,
+    /// Mean lambda return.
+    pub lambda_return: f64,
+    /// Mean value.
+    pub value: f64,
+    /// The returns' running range.
+    pub range: [f64; 2],
+}
+
+/// An optimiser's place on the machine.
+#[derive(Debug, Clone, Copy)]
+struct Optimiser {
+    group: Group,
+    scales: AdamScales,
+    table: u64,
+    clip: u64,
+}
+
+/// Room that is uploaded and downloaded.
+#[derive(Debug, Clone, Copy)]
+struct Room {
+    inputs: Inputs,
+    batch_images: u64,
+    batch_masks: u64,
+    features: Matrix,
+    scalars: Matrix,
+    behaviour_scalars: Matrix,
+    range: Matrix,
+    keep: u64,
+}
+
+/// The programs of a learner.
+#[derive(Debug)]
+struct Programs {
+    world: Ready,
+    masked: Ready,
+    judge: Ready,
+    behaviour: Option<Ready>,
+}
+
+/// World model, actor and critic on a machine.
+#[derive(Debug)]
+pub struct Learner {
+    machine: Machine,
+    weights: Weights,
+    settings: LearnerSettings,
+    room: Room,
+    optimisers: Vec<Optimiser>,
+    /// Steps of every parameter's optimiser, in the weights' order.
+    steps: Vec<u64>,
+    programs: Programs,
+}
+
+fn is_world(name: &str) -> bool {
+    !(name.starts_with("actor.") || is_critic(name) || name.starts_with("slow_critic."))
+}
+
+fn is_actor(name: &str) -> bool {
+    name.starts_with("actor.")
+}
+
+fn is_critic(name: &str) -> bool {
+    name.starts_with("critic.")
+}
+
+impl Learner {
+    /// A learner of parameters of these names and shapes, all zero; `bins` are the two-hot bins.
+    ///
+    /// # Errors
+    /// [`GpuError`], also where the settings ask for what no program does.
+    pub fn new(
+        mut machine: Machine,
+        specs: &[(String, Vec<usize>)],
+        bins: &[f32],
+        settings: LearnerSettings,
+    ) -> Result<Self, GpuError> {
+        check(&settings)?;
+        let weights = Weights::new(&mut machine, specs, bins, settings.sizes.model.deter)?;
+        let room = Room::new(&mut machine, &settings)?;
+        let mut optimisers = Vec::new();
+        let mut optimiser = |machine: &mut Machine, group, scales| {
+            let table = machine.allocate(8 * weights.entries().len())?;
+            Ok::<_, GpuError>(Optimiser { group, scales, table, clip: machine.allocate(8)? })
+        };
+        optimisers.push(optimiser(&mut machine, Group::World, settings.world_adam)?);
+        if let Some((_, actor, critic)) = settings.behaviour {
+            optimisers.push(optimiser(&mut machine, Group::Actor, actor)?);
+            optimisers.push(optimiser(&mut machine, Group::Critic, critic)?);
+        }
+        let programs = Programs::new(&mut machine, &weights, &settings, room, &optimisers)?;
+        let steps = vec![0; weights.entries().len()];
+        Ok(Self { machine, weights, settings, room, optimisers, steps, programs })
+    }
+
+    /// The parameters and everything beside them.
+    #[must_use]
+    pub fn weights(&self) -> &Weights {
+        &self.weights
+    }
+
+    /// The settings.
+    #[must_use]
+    pub fn settings(&self) -> &LearnerSettings {
+        &self.settings
+    }
+
+    /// Where it runs.
+    #[must_use]
+    pub fn machine(&self) -> &Machine {
+        &self.machine
+    }
+
+    /// Sets a parameter, a moment or the average, in the trainer's order of numbers.
+    ///
+    /// # Errors
+    /// [`GpuError::Failed`].
+    pub fn set(&mut self, array: Array, at: usize, values: &[f32]) -> Result<(), GpuError> {
+        let Self { machine, weights, .. } = self;
+        weights.set(machine, array, &weights.entries()[at], values)
+    }
+
+    /// The numbers of a parameter, a gradient, a moment or the average.
+    ///
+    /// # Errors
+    /// [`GpuError::Failed`].
+    pub fn get(&mut self, array: Array, at: usize) -> Result<Vec<f32>, GpuError> {
+        let Self { machine, weights, .. } = self;
+        weights.get(machine, array, &weights.entries()[at])
+    }
+
+    /// Steps of every parameter's optimiser, in the weights' order.
+    pub fn steps_mut(&mut self) -> &mut [u64] {
+        &mut self.steps
+    }
+
+    /// The returns' running range, to be set when a run is resumed.
+    ///
+    /// # Errors
+    /// [`GpuError::Failed`].
+    pub fn set_range(&mut self, range: [f64; 2]) -> Result<(), GpuError> {
+        let address = address(self.room.range);
+        self.machine.upload(address, &range.map(|x| x as f32))
+    }
+
+    /// Puts images, and masks where the settings store them, at places `from` and on of the store.
+    ///
+    /// # Errors
+    /// [`GpuError::Failed`].
+    pub fn store(&mut self, from: usize, images: &[u8], masks: &[u8]) -> Result<(), GpuError> {
+        let image = 64 * 64 * 3;
+        let count = images.len() / image;
+        if from + count > self.settings.stored_images || (!masks.is_empty() && masks.len() != count * 4096) {
+            return Err(GpuError::Unsupported(format!(
+                "images {from} to {} do not fit a store of {}",
+                from + count,
+                self.settings.stored_images
+            )));
+        }
+        self.machine.upload(self.room.inputs.images + (from * image) as u64, images)?;
+        if self.settings.stored_masks && !masks.is_empty() {
+            self.machine.upload(self.room.inputs.masks + (from * 4096) as u64, masks)?;
+        }
+        Ok(())
+    }
+
+    /// One update of the world model. `rate` is each parameter's learning rate, by name; `average` is the number of the update where the
+    /// running average follows. Where a loss or a gradient is not finite, nothing moves.
+    ///
+    /// # Errors
+    /// [`GpuError::Failed`].
+    pub fn update_world(
+        &mut self,
+        batch: &Batch<'_>,
+        noise: Noise,
+        rate: impl Fn(&str) -> f64,
+    ) -> Result<WorldValues, GpuError> {
+        self.upload(batch, noise)?;
+        self.upload_rates(0, rate)?;
+        let number = batch.number as f64 + 1.0;
+        let keep = self.settings.average_decay.min((1.0 + number) / (10.0 + number));
+        self.machine.upload(self.room.keep, &[keep as f32])?;
+        let program = if batch.masks { &mut self.programs.masked } else { &mut self.programs.world };
+        self.machine.run(program)?;
+        let values = self.world_values(batch.masks)?;
+        if values.total.is_finite() && values.gradient_norm.is_finite() {
+            self.count_step(0);
+        }
+        Ok(values)
+    }
+
+    /// The world model's losses of a batch; nothing moves.
+    ///
+    /// # Errors
+    /// [`GpuError::Failed`].
+    pub fn judge_world(&mut self, batch: &Batch<'_>, noise: Noise) -> Result<WorldValues, GpuError> {
+        self.upload(batch, noise)?;
+        self.machine.run(&mut self.programs.judge)?;
+        let values = self.world_values(false)?;
+        Ok(WorldValues { gradient_norm: 0.0, ..values })
+    }
+
+    /// One update of actor and critic from the posterior states of the last update of the world model, with the noise that follows its.
+    ///
+    /// # Errors
+    /// [`GpuError::Unsupported`] if the learner was made without behaviour, or [`GpuError::Failed`].
+    pub fn update_behaviour(&mut self, rate: impl Fn(&str) -> f64) -> Result<BehaviourValues, GpuError> {
+        self.upload_rates(1, &rate)?;
+        self.upload_rates(2, &rate)?;
+        let Some(program) = &mut self.programs.behaviour else {
+            return Err(GpuError::Unsupported("this learner was made without actor and critic".to_owned()));
+        };
+        self.machine.run(program)?;
+        let mut scalars = [0f32; behaviour::SCALARS];
+        self.machine.download(address(self.room.behaviour_scalars), &mut scalars)?;
+        let mut range = [0f32; 2];
+        self.machine.download(address(self.room.range), &mut range)?;
+        let [actor_loss, critic_loss, entropy, reward, lambda_return, value] = scalars.map(f64::from);
+        let mut norm = |which: usize| {
+            let mut clip = [0f32; 2];
+            self.machine.download(self.optimisers[which].clip, &mut clip)?;
+            Ok::<_, GpuError>(f64::from(clip[0]))
+        };
+        let (actor_gradient_norm, critic_gradient_norm) = (norm(1)?, norm(2)?);
+        let values = BehaviourValues {
+            actor_loss,
+            critic_loss,
+            actor_gradient_norm,
+            critic_gradient_norm,
+            entropy,
+            reward,
+            lambda_return,
+            value,
+            range: range.map(f64::from),
+        };
+        if actor_gradient_norm.is_finite() && critic_gradient_norm.is_finite() {
+            self.count_step(1);
+            self.count_step(2);
+        }
+        Ok(values)
+    }
+
+    /// How long the parts of the last updates' programs take, run command by command: world model, then behaviour. Moves the parameters as
+    /// an update does.
+    ///
+    /// # Errors
+    /// [`GpuError::Failed`].
+    pub fn time_parts(&mut self) -> Result<(Vec<PartTime>, Vec<PartTime>), GpuError> {
+        let world = self.machine.time_parts(&self.programs.world)?;
+        let behaviour = self.programs.behaviour.as_ref().map(|program| self.machine.time_parts(program));
+        Ok((world, behaviour.transpose()?.unwrap_or_default()))
+    }
+
+    /// Commands of an update of the world model and of behaviour.
+    #[must_use]
+    pub fn commands(&self) -> (usize, usize) {
+        (self.programs.world.commands(), self.programs.behaviour.as_ref().map_or(0, Ready::commands))
+    }
+
+    /// The posterior states of the last batch [T B, state], time-major.
+    ///
+    /// # Errors
+    /// [`GpuError::Failed`].
+    pub fn features(&mut self) -> Result<Vec<f32>, GpuError> {
+        let mut features = vec![0.0; self.room.features.len()];
+        self.machine.download(address(self.room.features), &mut features)?;
+        Ok(features)
+    }
+
+    fn count_step(&mut self, which: usize) {
+        let group = self.optimisers[which].group;
+        for (steps, entry) in self.steps.iter_mut().zip(self.weights.entries()) {
+            *steps += u64::from(entry.group == group);
+        }
+    }
+
+    fn upload_rates(&mut self, which: usize, rate: impl Fn(&str) -> f64) -> Result<(), GpuError> {
+        let Some(Optimiser { scales, table, .. }) = self.optimisers.get(which).copied() else { return Ok(()) };
+        let row = |(entry, steps): (&crate::weights::Entry, &u64)| {
+            let number = (*steps + 1).min(1 << 30) as i32;
+            let corrections = [scales.beta1, scales.beta2].map(|beta| 1.0 - beta.powi(number));
+            [(rate(&entry.name) / corrections[0]) as f32, (1.0 / corrections[1]) as f32]
+        };
+        let rows: Vec<f32> = self.weights.entries().iter().zip(&self.steps).flat_map(row).collect();
+        self.machine.upload(table, &rows)
+    }
+
+    fn upload(&mut self, batch: &Batch<'_>, noise: Noise) -> Result<(), GpuError> {
+        let sizes = &self.settings.sizes;
+        let (b, t) = (sizes.batch, sizes.length);
+        let (rows, action) = (b * t, sizes.model.action);
+        let fits = batch.action.len() == rows * action
+            && [batch.reward.len(), batch.terminal.len(), batch.first.len()] == [rows; 3]
+            && (batch.shift.is_empty() || batch.shift.len() == b);
+        if !fits {
+            return Err(GpuError::Unsupported(format!("the batch is not one of {b} sequences of {t} steps")));
+        }
+        // Row t * B + b is step t of sequence b.
+        let from = |row: usize| row % b * t + row / b;
+        let begins = |row: usize| row < b || batch.first[from(row)];
+        let flags: Vec<u32> = (0..rows).map(|row| u32::from(begins(row))).collect();
+        let mut actions = vec![0.0; rows * action];
+        for row in (0..rows).filter(|row| !begins(*row)) {
+            for (to, x) in actions[row * action..][..action].iter_mut().zip(&batch.action[from(row) * action..]) {
+                *to = x / x.abs().max(1.0);
+            }
+        }
+        let reward: Vec<f32> = (0..rows).map(|row| batch.reward[from(row)]).collect();
+        let terminal: Vec<f32> = (0..rows).map(|row| f32::from(u8::from(batch.terminal[from(row)]))).collect();
+        let every = sizes.paint_every as u64;
+        let painted: Vec<u32> = (0..rows as u32)
+            .filter(|row| (u64::from(*row) / b as u64 + batch.number).is_multiple_of(every))
+            .collect();
+        let mut control = [0u32; 10];
+        for (word, bytes) in control.iter_mut().zip(noise.key.as_chunks::<4>().0) {
+            *word = u32::from_le_bytes(*bytes);
+        }
+        [control[8], control[9]] = [noise.stream as u32, (noise.stream >> 32) as u32];
+        let shift = if batch.shift.is_empty() { vec![[0; 2]; b] } else { batch.shift.to_vec() };
+
+        let Room { inputs, batch_images, batch_masks, .. } = self.room;
+        let index: Vec<u32> = match batch.images {
+            Images::Stored(places) if places.len() == rows && self.settings.stored_images > 0 => {
+                (0..rows).map(|row| places[from(row)]).collect()
+            }
+            Images::Host(images, masks)
+                if images.len() == rows * 12288
+                    && self.settings.stored_images == 0
+                    && (!batch.masks || masks.len() == rows * 4096) =>
+            {
+                self.machine.upload(batch_images, images)?;
+                if batch.masks {
+                    self.machine.upload(batch_masks, masks)?;
+                }
+                (0..rows).map(|row| from(row) as u32).collect()
+            }
+            _ => return Err(GpuError::Unsupported("the batch's images are not where they are expected".to_owned())),
+        };
+        let machine = &mut self.machine;
+        machine.upload(inputs.index, &index)?;
+        machine.upload(inputs.shift, &shift)?;
+        machine.upload(inputs.action, &actions)?;
+        machine.upload(inputs.reward, &reward)?;
+        machine.upload(inputs.terminal, &terminal)?;
+        machine.upload(inputs.first, &flags)?;
+        machine.upload(inputs.painted, &painted)?;
+        machine.upload(inputs.noise, &control)
+    }
+
+    fn world_values(&mut self, masks: bool) -> Result<WorldValues, GpuError> {
+        let mut scalars = [0f32; world::SCALARS];
+        self.machine.download(address(self.room.scalars), &mut scalars)?;
+        let mut clip = [0f32; 2];
+        self.machine.download(self.optimisers[0].clip, &mut clip)?;
+        let [image, mask, reward, continues, first, first_floored, second, second_floored] = scalars.map(f64::from);
+        let scales = self.settings.world;
+        let factor = f64::from(scales.dynamics) + f64::from(scales.representation);
+        let mut total = f64::from(scales.image) * image
+            + f64::from(scales.reward) * reward
+            + f64::from(scales.continues) * continues
+            + factor * first_floored;
+        if self.settings.sizes.branches() == 2 {
+            total += factor * second_floored;
+        }
+        if masks {
+            total += f64::from(scales.mask) * mask;
+        }
+        let robot_mask = masks.then_some(mask);
+        let gradient_norm = f64::from(clip[0]);
+        Ok(WorldValues { image, robot_mask, reward, continues, kl: [first, second], total, gradient_norm })
+    }
+}
+
+fn address(matrix: Matrix) -> u64 {
+    match matrix.place {
+        crate::program::Place::Fixed(address) => address,
+        crate::program::Place::Transient(_) => unreachable!("a room has fixed places alone"),
+    }
+}
+
+fn check(settings: &LearnerSettings) -> Result<(), GpuError> {
+    let Sizes { model, length, paint_every, .. } = &settings.sizes;
+    let refuse = |text: String| Err(GpuError::Unsupported(text));
+    if *paint_every == 0 || !length.is_multiple_of(*paint_every) {
+        return refuse(format!(
+            "world.paint_every = {paint_every} does not divide replay.length = {length}, as updates on a GPU need"
+        ));
+    }
+    if model.classes > 32 || model.categoricals > 64 {
+        return refuse(format!(
+            "{} categoricals of {} classes; updates on a GPU take at most 64 of 32",
+            model.categoricals, model.classes
+        ));
+    }
+    if settings.behaviour.is_some_and(|(scales, ..)| scales.length < 2) {
+        return refuse("behaviour.horizon.length must be at least 2".to_owned());
+    }
+    Ok(())
+}
+
+impl Room {
+    fn new(machine: &mut Machine, settings: &LearnerSettings) -> Result<Self, GpuError> {
+        let sizes = &settings.sizes;
+        let rows = sizes.rows();
+        let stored = settings.stored_images > 0;
+        let images = if stored { settings.stored_images } else { rows };
+        let masks = if !stored || settings.stored_masks { images } else { 1 };
+        let (images, masks) = (machine.allocate(images * 12288)?, machine.allocate(masks * 4096)?);
+        let mut words = |count: usize| machine.allocate(4 * count);
+        let inputs = Inputs {
+            images,
+            masks,
+            index: words(rows)?,
+            shift: words(2 * sizes.batch)?,
+            action: words(rows * sizes.model.action)?,
+            reward: words(rows)?,
+            terminal: words(rows)?,
+            first: words(rows)?,
+            painted: words(rows)?,
+            noise: words(10)?,
+        };
+        Ok(Self {
+            inputs,
+            batch_images: images,
+            batch_masks: masks,
+            features: Matrix::fixed(words(rows * sizes.state())?, rows, sizes.state()),
+            scalars: Matrix::fixed(words(world::SCALARS)?, 1, world::SCALARS),
+            behaviour_scalars: Matrix::fixed(words(behaviour::SCALARS)?, 1, behaviour::SCALARS),
+            range: Matrix::fixed(words(2)?, 1, 2),
+            keep: words(1)?,
+        })
+    }
+}
+
+impl Programs {
+    fn new(
+        machine: &mut Machine,
+        weights: &Weights,
+        settings: &LearnerSettings,
+        room: Room,
+        optimisers: &[Optimiser],
+    ) -> Result<Self, GpuError> {
+        let world = |masks: bool, learns: bool| {
+            let mut tape = Tape::default();
+            let trains: fn(&str) -> bool = if learns { is_world } else { |_| false };
+            let source = Source { weights, trains };
+            if learns {
+                tape.program.part("optimiser");
+                tape.zero(weights.group(Array::Gradients, Group::World));
+            }
+            let parts = (settings.world, masks);
+            let out = (room.features, room.scalars);
+            if learns {
+                world::losses(&mut tape, source, &settings.sizes, room.inputs, parts, out);
+                let average = (settings.average_decay > 0.0).then_some(room.keep);
+                step(&mut tape, weights, optimisers[0], room.scalars, average);
+            } else {
+                let sizes = &settings.sizes;
+                tape.without_gradient(|tape| world::losses(tape, source, sizes, room.inputs, parts, out));
+            }
+            tape.program
+        };
+        let behaviour = settings.behaviour.map(|(scales, ..)| {
+            let mut tape = Tape::default();
+            tape.program.part("optimiser");
+            for group in [Group::Actor, Group::Critic] {
+                tape.zero(weights.group(Array::Gradients, group));
+            }
+            let values = |group| weights.group(Array::Values, group);
+            let (critic, slow) = (values(Group::Critic), values(Group::SlowCritic));
+            let p = [critic, slow].map(Pointer::from);
+            tape.program.kernel(Kernel::Mix, Grid::elements(critic.len()), &p, &[critic.len()], &[scales.slow_share]);
+            let source = |trains: fn(&str) -> bool| Source { weights, trains };
+            let sources = Sources { frozen: source(|_| false), actor: source(is_actor), critic: source(is_critic) };
+            let noise = (room.inputs.noise, settings.sizes.words());
+            let out = (room.range, room.behaviour_scalars);
+            behaviour::losses(&mut tape, sources, &settings.sizes, &scales, room.features, noise, out);
+            for optimiser in &optimisers[1..] {
+                step(&mut tape, weights, *optimiser, room.behaviour_scalars, None);
+            }
+            tape.program
+        });
+        let programs: Vec<Program> =
+            [world(false, true), world(true, true), world(false, false)].into_iter().chain(behaviour).collect();
+        let layouts: Vec<_> = programs.iter().map(Program::layout).collect();
+        let bytes = layouts.iter().map(|(_, bytes)| *bytes).max().unwrap_or_default();
+        let arena = Arena::new(machine, bytes)?;
+        let mut ready = programs.into_iter().zip(layouts).map(|(program, (offsets, bytes))| {
+            machine.prepare(program.finish(&offsets, bytes, &arena))
+        });
+        let mut next = || ready.next().expect("there are as many as were built");
+        Ok(Self { world: next(), masked: next(), judge: next(), behaviour: ready.next() })
+    }
+}
+
+/// Adds the clipping by the norm and one step of Adam.
+fn step(tape: &mut Tape, weights: &Weights, optimiser: Optimiser, scalars: Matrix, keep: Option<u64>) {
+    const RUN: usize = 16_384;
+    tape.program.part("optimiser");
+    let Optimiser { group, scales, table, clip } = optimiser;
+    let array = |array: Array| weights.group(array, group);
+    let gradient = array(Array::Gradients);
+    let (count, clip) = (gradient.len(), Matrix::fixed(clip, 1, 2));
+    let blocks = count.div_ceil(RUN);
+    let partial = tape.matrix(1, blocks);
+    let grid = Grid { blocks, threads: 512, shared_bytes: 0 };
+    tape.program.kernel(Kernel::Squares, grid, &[gradient.into(), partial.into()], &[count, RUN], &[]);
+    let p = [partial, scalars, clip].map(Pointer::from);
+    let grid = Grid { blocks: 1, threads: 512, shared_bytes: 0 };
+    tape.program.kernel(Kernel::Clip, grid, &p, &[blocks, scalars.len()], &[scales.clip_norm]);
+    let fixed = |address: u64| Pointer::from(Matrix::fixed(address, 1, 1));
+    let arrays = [Array::Values, Array::First, Array::Second, Array::Gradients].map(|a| Pointer::from(array(a)));
+    let average = keep.map_or([Pointer::NULL; 2], |keep| [array(Array::Average).into(), fixed(keep)]);
+    let p = [&arrays[..], &[clip.into(), fixed(weights.owners(group)), fixed(table)], &average].concat();
+    let f = [scales.beta1 as f32, scales.beta2 as f32, scales.eps];
+    tape.program.kernel(Kernel::Adam, Grid::elements(count), &p, &[count], &f);
+}

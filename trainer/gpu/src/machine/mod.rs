@@ -1,0 +1,290 @@
+//! Where programs run.
+
+mod host;
+#[cfg(feature = "cuda")]
+mod nvidia;
+
+use crate::program::Finished;
+
+pub use host::Host;
+#[cfg(feature = "cuda")]
+pub use nvidia::Nvidia;
+
+/// Why something did not run on a machine.
+#[derive(Debug, thiserror::Error)]
+pub enum GpuError {
+    /// The driver, cuBLAS or NVRTC could not be loaded.
+    #[error("no NVIDIA GPU can be used: {0}; install its driver and CUDA 13 (cuBLAS and NVRTC), or leave --device out")]
+    Unavailable(String),
+    /// This build has no GPU support.
+    #[error("this program was built without the feature `cuda`; build it with its default features, or leave --device out")]
+    NotBuilt,
+    /// There is not enough memory.
+    #[error("the GPU has no {bytes} bytes of memory left ({reason}); take a smaller batch")]
+    Memory {
+        /// What was asked for.
+        bytes: usize,
+        /// What the driver said.
+        reason: String,
+    },
+    /// A call of the driver or a library failed.
+    #[error("the GPU failed in {what}: {reason}")]
+    Failed {
+        /// What was called.
+        what: &'static str,
+        /// What it said.
+        reason: String,
+    },
+    /// The settings ask for something that no program does.
+    #[error("{0}")]
+    Unsupported(String),
+}
+
+/// Precision of matrix products. Sums, weights and everything else stay f32.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
+pub enum Precision {
+    /// f32 throughout.
+    #[default]
+    F32,
+    /// Operands with 10 bits of mantissa (TF32) on the tensor cores.
+    Tf32,
+    /// Operands with 7 bits of mantissa (bf16) on the tensor cores.
+    Bf16,
+}
+
+/// The host, or a GPU.
+#[derive(Debug)]
+pub enum Machine {
+    /// The kernels compiled as C.
+    Host(Host),
+    /// An NVIDIA GPU.
+    #[cfg(feature = "cuda")]
+    Nvidia(Box<Nvidia>),
+}
+
+/// A program ready to run on a machine.
+#[derive(Debug)]
+pub struct Ready {
+    finished: Finished,
+    #[cfg(feature = "cuda")]
+    graph: Option<nvidia::Graph>,
+}
+
+/// How long a part of a program took.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct PartTime {
+    /// The part.
+    pub part: &'static str,
+    /// Commands in it.
+    pub commands: usize,
+    /// Time on the device.
+    pub ms: f64,
+    /// Operations of its matrix products.
+    pub flops: f64,
+}
+
+impl Machine {
+    /// The host.
+    #[must_use]
+    pub fn host() -> Self {
+        Self::Host(Host::default())
+    }
+
+    /// The GPU of this number.
+    ///
+    /// # Errors
+    /// [`GpuError::Unavailable`], [`GpuError::NotBuilt`] or [`GpuError::Failed`].
+    pub fn nvidia(ordinal: usize, precision: Precision) -> Result<Self, GpuError> {
+        #[cfg(feature = "cuda")]
+        return Ok(Self::Nvidia(Box::new(Nvidia::new(ordinal, precision)?)));
+        #[cfg(not(feature = "cuda"))]
+        {
+            let _ = (ordinal, precision);
+            Err(GpuError::NotBuilt)
+        }
+    }
+
+    /// What it is, in words.
+    #[must_use]
+    pub fn name(&self) -> String {
+        match self {
+            Self::Host(_) => "host".to_owned(),
+            #[cfg(feature = "cuda")]
+            Self::Nvidia(gpu) => gpu.name(),
+        }
+    }
+
+    /// Memory of this many bytes, all zero, until the machine is dropped.
+    ///
+    /// # Errors
+    /// [`GpuError::Memory`].
+    pub fn allocate(&mut self, bytes: usize) -> Result<u64, GpuError> {
+        match self {
+            Self::Host(host) => Ok(host.allocate(bytes)),
+            #[cfg(feature = "cuda")]
+            Self::Nvidia(gpu) => gpu.allocate(bytes),
+        }
+    }
+
+    /// Bytes allocated.
+    #[must_use]
+    pub fn allocated(&self) -> usize {
+        match self {
+            Self::Host(host) => host.allocated(),
+            #[cfg(feature = "cuda")]
+            Self::Nvidia(gpu) => gpu.allocated(),
+        }
+    }
+
+    /// Copies numbers to an address that [`Machine::allocate`] gave, after everything that was run before.
+    ///
+    /// # Errors
+    /// [`GpuError::Failed`].
+    pub fn upload<T: bytemuck::Pod>(&mut self, address: u64, values: &[T]) -> Result<(), GpuError> {
+        let bytes = bytemuck::cast_slice(values);
+        match self {
+            Self::Host(host) => host.upload(address, bytes),
+            #[cfg(feature = "cuda")]
+            Self::Nvidia(gpu) => gpu.upload(address, bytes)?,
+        }
+        Ok(())
+    }
+
+    /// Copies numbers from an address, after everything that was run before.
+    ///
+    /// # Errors
+    /// [`GpuError::Failed`].
+    pub fn download<T: bytemuck::Pod>(&mut self, address: u64, values: &mut [T]) -> Result<(), GpuError> {
+        let bytes = bytemuck::cast_slice_mut(values);
+        match self {
+            Self::Host(host) => host.download(address, bytes),
+            #[cfg(feature = "cuda")]
+            Self::Nvidia(gpu) => gpu.download(address, bytes)?,
+        }
+        Ok(())
+    }
+
+    /// Makes a program ready.
+    #[must_use]
+    pub fn prepare(&self, finished: Finished) -> Ready {
+        Ready {
+            finished,
+            #[cfg(feature = "cuda")]
+            graph: None,
+        }
+    }
+
+    /// Runs a program; on a GPU it is captured the first time and replayed from then on, and may be under way when this returns.
+    ///
+    /// # Errors
+    /// [`GpuError::Failed`].
+    pub fn run(&mut self, program: &mut Ready) -> Result<(), GpuError> {
+        match self {
+            Self::Host(host) => host.run(&program.finished),
+            #[cfg(feature = "cuda")]
+            Self::Nvidia(gpu) => gpu.run(&program.finished, &mut program.graph)?,
+        }
+        Ok(())
+    }
+
+    /// Runs a program command by command and says how long each part took.
+    ///
+    /// # Errors
+    /// [`GpuError::Failed`].
+    pub fn time_parts(&mut self, program: &Ready) -> Result<Vec<PartTime>, GpuError> {
+        match self {
+            Self::Host(host) => Ok(host.time_parts(&program.finished)),
+            #[cfg(feature = "cuda")]
+            Self::Nvidia(gpu) => gpu.time_parts(&program.finished),
+        }
+    }
+}
+
+impl Ready {
+    /// Commands in it: kernels and matrix products.
+    #[must_use]
+    pub fn commands(&self) -> usize {
+        self.finished.commands.len()
+    }
+
+    /// Memory of its buffers.
+    #[must_use]
+    pub fn bytes(&self) -> usize {
+        self.finished.bytes
+    }
+}
+
+macro_rules! kernels {
+    ($($variant:ident $name:ident),* $(,)?) => {
+        /// A kernel of `kernels/`.
+        #[derive(Debug, Clone, Copy, PartialEq, Eq, Hash)]
+        #[allow(missing_docs, reason = "each is described where it is written, in `kernels/`")]
+        pub enum Kernel { $($variant),* }
+
+        impl Kernel {
+            /// All of them.
+            pub const ALL: &[Self] = &[$(Self::$variant),*];
+
+            /// Its name in the source.
+            #[must_use]
+            pub fn name(self) -> &'static str {
+                match self { $(Self::$variant => stringify!($name)),* }
+            }
+
+            /// Its function on the host.
+            fn on_host(self) -> host::Function {
+                match self { $(Self::$variant => host::functions::$name),* }
+            }
+        }
+
+        macro_rules! host_functions { () => { $(pub fn $name(a: Args, block: i64, blocks: i64);)* } }
+        pub(in crate::machine) use host_functions;
+    };
+}
+
+kernels! {
+    NormForward norm_forward, NormBackward norm_backward, NormParameters norm_parameters,
+    ColumnSums column_sums, SumPartials sum_partials, CellForward cell_forward, CellBackward cell_backward,
+    Draw draw, DrawBackward draw_backward, BalancedKl balanced_kl,
+    FillRows fill_rows, CopyRows copy_rows, GatherRows gather_rows, Zero zero, Tanh tanh_of,
+    Carry carry, CarryBackward carry_backward, NormaliseAction normalise_action, SumOf sum_of, Noise noise,
+    InteractionForward interaction_forward, InteractionBackward interaction_backward,
+    Windows windows, FromWindows from_windows, GatherImages gather_images, PictureLoss picture_loss,
+    TwoHotLoss two_hot_loss, TwoHotMean two_hot_mean, ContinueLoss continue_loss, ScaledSigmoid scaled_sigmoid,
+    ActorDraw actor_draw, ActorBackward actor_backward, LambdaReturns lambda_returns, ActorLoss actor_loss,
+    ReturnRange return_range, Squares squares, Clip clip, Adam adam, Mix mix,
+}
+
+/// Arguments as kernels take them; the same in `kernels/common.h`.
+#[repr(C)]
+#[derive(Debug, Clone, Copy, Default)]
+pub(in crate::machine) struct Args {
+    p: [u64; 16],
+    n: [i64; 16],
+    f: [f32; 8],
+}
+
+impl Args {
+    fn new(p: &[crate::program::Pointer], n: &[i64], f: &[f32]) -> Self {
+        let mut args = Self::default();
+        for (to, from) in args.p.iter_mut().zip(p) {
+            *to = from.place.map_or(0, |place| address(place) + from.bytes as u64);
+        }
+        args.n[..n.len()].copy_from_slice(n);
+        args.f[..f.len()].copy_from_slice(f);
+        args
+    }
+}
+
+/// The address of a place in a finished program.
+fn address(place: crate::program::Place) -> u64 {
+    match place {
+        crate::program::Place::Fixed(address) => address,
+        crate::program::Place::Transient(_) => unreachable!("a finished program has fixed places alone"),
+    }
+}
+
+/// The address of a matrix's first number.
+fn begin(matrix: crate::program::Matrix) -> u64 {
+    address(matrix.place) + 4 * matrix.offset as u64
+}

@@ -1,0 +1,266 @@
+//! NVIDIA GPUs: kernels compiled by NVRTC when the machine is made, products by cuBLAS, programs as CUDA graphs.
+
+use std::collections::HashMap;
+use std::ffi::c_void;
+use std::panic::{AssertUnwindSafe, catch_unwind};
+use std::sync::Arc;
+
+use cudarc::cublas::{CudaBlas, result as blas, sys as blas_sys};
+use cudarc::driver::{
+    CudaContext, CudaEvent, CudaFunction, CudaGraph, CudaSlice, CudaStream, DevicePtr, DeviceRepr, LaunchConfig,
+    PushKernelArg, result, sys,
+};
+use cudarc::nvrtc::{CompileOptions, compile_ptx_with_opts};
+
+use super::host::flops;
+use super::{Args, GpuError, Kernel, PartTime, Precision, begin};
+use crate::program::{Command, Finished, Product};
+
+// SAFETY: plain numbers in C's layout, the same on host and device.
+unsafe impl DeviceRepr for Args {}
+
+const SOURCES: [&str; 8] = [
+    include_str!("../../kernels/common.h"),
+    include_str!("../../kernels/adam.c"),
+    include_str!("../../kernels/categorical.c"),
+    include_str!("../../kernels/conv.c"),
+    include_str!("../../kernels/heads.c"),
+    include_str!("../../kernels/interaction.c"),
+    include_str!("../../kernels/norm.c"),
+    include_str!("../../kernels/rows.c"),
+];
+
+/// Memory that cuBLAS works in: what NVIDIA recommends for Hopper.
+const WORKSPACE_BYTES: usize = 32 << 20;
+/// Shared memory of a block beyond which the driver must be asked.
+const SHARED_BYTES_DEFAULT: usize = 48 << 10;
+
+/// A GPU with a stream of its own.
+pub struct Nvidia {
+    stream: Arc<CudaStream>,
+    blas: CudaBlas,
+    kernels: HashMap<Kernel, CudaFunction>,
+    memory: Vec<CudaSlice<u8>>,
+    precision: Precision,
+}
+
+impl std::fmt::Debug for Nvidia {
+    fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
+        f.debug_struct("Nvidia").field("precision", &self.precision).finish_non_exhaustive()
+    }
+}
+
+/// A captured program.
+pub struct Graph(CudaGraph);
+
+impl std::fmt::Debug for Graph {
+    fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
+        f.write_str("Graph")
+    }
+}
+
+// SAFETY: a graph belongs to one learner, which uses it from one thread at a time.
+unsafe impl Send for Graph {}
+
+/// The kernels as one source: the header once, and no includes.
+pub fn source() -> String {
+    SOURCES.concat().lines().filter(|line| !line.starts_with("#include \"common.h\"")).collect::<Vec<_>>().join("\n")
+}
+
+fn failed<E: std::fmt::Debug>(what: &'static str) -> impl FnOnce(E) -> GpuError {
+    move |reason| GpuError::Failed { what, reason: format!("{reason:?}") }
+}
+
+impl Nvidia {
+    pub(super) fn new(ordinal: usize, precision: Precision) -> Result<Self, GpuError> {
+        // Libraries that are not there make cudarc panic; that is no reason to print a backtrace.
+        let hook = std::panic::take_hook();
+        std::panic::set_hook(Box::new(|_| {}));
+        let made = catch_unwind(AssertUnwindSafe(|| Self::make(ordinal, precision)));
+        std::panic::set_hook(hook);
+        made.unwrap_or_else(|panic| {
+            let text = panic.downcast_ref::<String>().cloned().unwrap_or_else(|| "a library is missing".to_owned());
+            Err(GpuError::Unavailable(text.lines().next().unwrap_or_default().to_owned()))
+        })
+    }
+
+    fn make(ordinal: usize, precision: Precision) -> Result<Self, GpuError> {
+        let context = CudaContext::new(ordinal).map_err(|error| GpuError::Unavailable(format!("{error}")))?;
+        // SAFETY: everything runs on one stream, in order; no event has to guard memory.
+        unsafe { context.disable_event_tracking() };
+        let stream = context.new_stream().map_err(failed("making a stream"))?;
+        let (major, minor) = context.compute_capability().map_err(failed("asking for the architecture"))?;
+        let options = CompileOptions {
+            options: vec![format!("--gpu-architecture=sm_{major}{minor}"), "--fmad=true".to_owned()],
+            ..CompileOptions::default()
+        };
+        let ptx = compile_ptx_with_opts(source(), options)
+            .map_err(|error| GpuError::Failed { what: "compiling the kernels", reason: format!("{error:?}") })?;
+        let module = context.load_module(ptx).map_err(failed("loading the kernels"))?;
+        let mut kernels = HashMap::new();
+        for kernel in Kernel::ALL {
+            let function = module.load_function(kernel.name()).map_err(failed("finding a kernel"))?;
+            kernels.insert(*kernel, function);
+        }
+        for kernel in [Kernel::InteractionForward, Kernel::InteractionBackward] {
+            let most = context
+                .attribute(sys::CUdevice_attribute::CU_DEVICE_ATTRIBUTE_MAX_SHARED_MEMORY_PER_BLOCK_OPTIN)
+                .map_err(failed("asking for shared memory"))?;
+            let attribute = sys::CUfunction_attribute::CU_FUNC_ATTRIBUTE_MAX_DYNAMIC_SHARED_SIZE_BYTES;
+            if let Some(function) = kernels.get(&kernel) {
+                function.set_attribute(attribute, most).map_err(failed("asking for shared memory"))?;
+            }
+        }
+        let cublas = CudaBlas::new(stream.clone()).map_err(failed("starting cuBLAS"))?;
+        let mut machine = Self { stream, blas: cublas, kernels, memory: Vec::new(), precision };
+        let workspace = machine.allocate(WORKSPACE_BYTES)?;
+        // SAFETY: the workspace lives as long as the handle.
+        let status = unsafe {
+            blas_sys::cublasSetWorkspace_v2(*machine.blas.handle(), workspace as *mut c_void, WORKSPACE_BYTES)
+        };
+        status.result().map_err(failed("giving cuBLAS memory"))?;
+        let mode = match precision {
+            Precision::F32 | Precision::Bf16 => blas_sys::cublasMath_t::CUBLAS_DEFAULT_MATH,
+            Precision::Tf32 => blas_sys::cublasMath_t::CUBLAS_TF32_TENSOR_OP_MATH,
+        };
+        // SAFETY: the handle is alive.
+        unsafe { blas_sys::cublasSetMathMode(*machine.blas.handle(), mode) }
+            .result()
+            .map_err(failed("choosing cuBLAS's precision"))?;
+        Ok(machine)
+    }
+
+    pub(super) fn name(&self) -> String {
+        self.stream.context().name().unwrap_or_else(|_| "an NVIDIA GPU".to_owned())
+    }
+
+    pub(super) fn allocate(&mut self, bytes: usize) -> Result<u64, GpuError> {
+        let slice = self
+            .stream
+            .alloc_zeros::<u8>(bytes)
+            .map_err(|error| GpuError::Memory { bytes, reason: format!("{error}") })?;
+        let (address, _) = slice.device_ptr(&self.stream);
+        self.memory.push(slice);
+        Ok(address)
+    }
+
+    pub(super) fn allocated(&self) -> usize {
+        self.memory.iter().map(CudaSlice::len).sum()
+    }
+
+    pub(super) fn upload(&mut self, address: u64, bytes: &[u8]) -> Result<(), GpuError> {
+        // SAFETY: the range lies in this machine's memory. Pageable memory is read before the call returns.
+        unsafe { result::memcpy_htod_async(address, bytes, self.stream.cu_stream()) }.map_err(failed("an upload"))?;
+        Ok(())
+    }
+
+    pub(super) fn download(&mut self, address: u64, bytes: &mut [u8]) -> Result<(), GpuError> {
+        // SAFETY: the range lies in this machine's memory, and the copy has ended when the stream has.
+        unsafe { result::memcpy_dtoh_async(bytes, address, self.stream.cu_stream()) }.map_err(failed("a download"))?;
+        self.stream.synchronize().map_err(failed("running a program"))
+    }
+
+    pub(super) fn run(&mut self, program: &Finished, graph: &mut Option<Graph>) -> Result<(), GpuError> {
+        if graph.is_none() {
+            self.stream.synchronize().map_err(failed("waiting"))?;
+            let mode = sys::CUstreamCaptureMode::CU_STREAM_CAPTURE_MODE_THREAD_LOCAL;
+            self.stream.begin_capture(mode).map_err(failed("beginning a capture"))?;
+            let captured = program.commands.iter().try_for_each(|(_, command)| self.execute(command));
+            let made = self.stream.end_capture(sys::CUgraphInstantiate_flags(0));
+            captured?;
+            let made = made.map_err(failed("capturing a program"))?;
+            *graph = made.map(Graph);
+        }
+        match graph {
+            Some(graph) => graph.0.launch().map_err(failed("launching a program")),
+            None => Ok(()),
+        }
+    }
+
+    pub(super) fn time_parts(&mut self, program: &Finished) -> Result<Vec<PartTime>, GpuError> {
+        let mut times: Vec<PartTime> =
+            program.parts.iter().map(|part| PartTime { part, commands: 0, ms: 0.0, flops: 0.0 }).collect();
+        let event = |machine: &Self| {
+            let flags = Some(sys::CUevent_flags::CU_EVENT_DEFAULT);
+            machine.stream.record_event(flags).map_err(failed("recording an event"))
+        };
+        let mut spans: Vec<(u16, CudaEvent)> = Vec::new();
+        for (part, command) in &program.commands {
+            if spans.last().is_none_or(|(last, _)| last != part) {
+                spans.push((*part, event(self)?));
+            }
+            self.execute(command)?;
+            times[usize::from(*part)].commands += 1;
+            times[usize::from(*part)].flops += flops(command);
+        }
+        let end = event(self)?;
+        self.stream.synchronize().map_err(failed("running a program"))?;
+        let ends: Vec<&CudaEvent> = spans.iter().skip(1).map(|(_, event)| event).chain([&end]).collect();
+        for ((part, begin), end) in spans.iter().zip(ends) {
+            let ms = begin.elapsed_ms(end).map_err(failed("timing"))?;
+            times[usize::from(*part)].ms += f64::from(ms);
+        }
+        Ok(times)
+    }
+
+    fn execute(&self, command: &Command) -> Result<(), GpuError> {
+        match command {
+            Command::Kernel { kernel, grid, p, n, f } => {
+                let args = Args::new(p, n, f);
+                let config = LaunchConfig {
+                    grid_dim: (grid.blocks as u32, 1, 1),
+                    block_dim: (grid.threads as u32, 1, 1),
+                    shared_mem_bytes: grid.shared_bytes as u32,
+                };
+                let mut launch = self.stream.launch_builder(&self.kernels[kernel]);
+                launch.arg(&args);
+                // SAFETY: the arguments are those that the kernel's description names, and its buffers are as large as its counts say.
+                unsafe { launch.launch(config) }.map_err(|error| GpuError::Failed {
+                    what: kernel.name(),
+                    reason: format!("{error}"),
+                })?;
+                Ok(())
+            }
+            Command::Product(product) => self.multiply(product),
+        }
+    }
+
+    fn multiply(&self, p: &Product) -> Result<(), GpuError> {
+        use blas_sys::cublasOperation_t::{CUBLAS_OP_N, CUBLAS_OP_T};
+        let (m, n, k) = p.sizes();
+        let operation = |transposed: bool| if transposed { CUBLAS_OP_T } else { CUBLAS_OP_N };
+        let compute = match self.precision {
+            Precision::F32 => blas_sys::cublasComputeType_t::CUBLAS_COMPUTE_32F,
+            Precision::Tf32 => blas_sys::cublasComputeType_t::CUBLAS_COMPUTE_32F_FAST_TF32,
+            Precision::Bf16 => blas_sys::cublasComputeType_t::CUBLAS_COMPUTE_32F_FAST_16BF,
+        };
+        let (one, beta) = (1f32, if p.add { 1f32 } else { 0f32 });
+        let f32_type = blas_sys::cudaDataType_t::CUDA_R_32F;
+        // cuBLAS counts columns first: the transposed product of the transposes.
+        // SAFETY: the matrices' sizes were checked when the product was added, and they lie in this machine's memory.
+        unsafe {
+            blas::gemm_ex(
+                *self.blas.handle(),
+                operation(p.b_transposed),
+                operation(p.a_transposed),
+                n as i32,
+                m as i32,
+                k as i32,
+                (&raw const one).cast(),
+                begin(p.b) as *const c_void,
+                f32_type,
+                p.b.stride as i32,
+                begin(p.a) as *const c_void,
+                f32_type,
+                p.a.stride as i32,
+                (&raw const beta).cast(),
+                begin(p.c) as *mut c_void,
+                f32_type,
+                p.c.stride as i32,
+                compute,
+                blas_sys::cublasGemmAlgo_t::CUBLAS_GEMM_DEFAULT,
+            )
+        }
+        .map_err(failed("a matrix product"))
+    }
+}

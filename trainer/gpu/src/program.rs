@@ -1,0 +1,366 @@
+//! Commands over buffers, and how buffers that are not needed at the same time share memory.
+
+use std::ops::Range;
+
+use crate::machine::{GpuError, Kernel, Machine};
+
+/// A place in memory.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Hash)]
+pub enum Place {
+    /// An address that outlives programs.
+    Fixed(u64),
+    /// A buffer of a program, given an address when the program is finished.
+    Transient(u32),
+}
+
+/// A matrix of f32 [rows, cols] whose columns are contiguous and whose rows are `stride` numbers apart.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct Matrix {
+    /// Its buffer.
+    pub place: Place,
+    /// Where it begins in the buffer, in numbers.
+    pub offset: usize,
+    /// Rows.
+    pub rows: usize,
+    /// Columns.
+    pub cols: usize,
+    /// Distance of rows, in numbers.
+    pub stride: usize,
+}
+
+impl Matrix {
+    /// A contiguous matrix at an address.
+    #[must_use]
+    pub fn fixed(address: u64, rows: usize, cols: usize) -> Self {
+        Self { place: Place::Fixed(address), offset: 0, rows, cols, stride: cols }
+    }
+
+    /// Some of its rows.
+    #[must_use]
+    pub fn rows(self, rows: Range<usize>) -> Self {
+        assert!(rows.end <= self.rows, "rows {rows:?} of {}", self.rows);
+        Self { offset: self.offset + rows.start * self.stride, rows: rows.len(), ..self }
+    }
+
+    /// Some of its columns.
+    #[must_use]
+    pub fn columns(self, columns: Range<usize>) -> Self {
+        assert!(columns.end <= self.cols, "columns {columns:?} of {}", self.cols);
+        Self { offset: self.offset + columns.start, cols: columns.len(), ..self }
+    }
+
+    /// The same numbers in rows of another length.
+    #[must_use]
+    pub fn reshape(self, rows: usize, cols: usize) -> Self {
+        assert!(self.is_contiguous() && rows * cols == self.len(), "{self:?} as {rows} x {cols}");
+        Self { rows, cols, stride: cols, ..self }
+    }
+
+    /// Numbers in it.
+    #[must_use]
+    pub fn len(self) -> usize {
+        self.rows * self.cols
+    }
+
+    /// Whether it holds nothing.
+    #[must_use]
+    pub fn is_empty(self) -> bool {
+        self.len() == 0
+    }
+
+    /// Whether its rows follow each other without a gap.
+    #[must_use]
+    pub fn is_contiguous(self) -> bool {
+        self.stride == self.cols || self.rows == 1
+    }
+
+    /// The pointer to its first number.
+    #[must_use]
+    pub fn pointer(self) -> Pointer {
+        Pointer { place: Some(self.place), bytes: 4 * self.offset }
+    }
+}
+
+/// An argument that is an address; null without a place.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct Pointer {
+    /// The buffer.
+    pub place: Option<Place>,
+    /// Distance from its begin.
+    pub bytes: usize,
+}
+
+impl Pointer {
+    /// No address.
+    pub const NULL: Self = Self { place: None, bytes: 0 };
+}
+
+impl From<Matrix> for Pointer {
+    fn from(matrix: Matrix) -> Self {
+        matrix.pointer()
+    }
+}
+
+impl From<Option<Matrix>> for Pointer {
+    fn from(matrix: Option<Matrix>) -> Self {
+        matrix.map_or(Self::NULL, Matrix::pointer)
+    }
+}
+
+/// How a kernel is spread over blocks.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub struct Grid {
+    /// Blocks.
+    pub blocks: usize,
+    /// Threads of a block.
+    pub threads: usize,
+    /// Shared memory of a block.
+    pub shared_bytes: usize,
+}
+
+/// Blocks beyond which a kernel's threads take turns.
+const BLOCKS_MAX: usize = 132 * 16;
+
+impl Grid {
+    /// A thread for each of `count` numbers.
+    #[must_use]
+    pub fn elements(count: usize) -> Self {
+        Self { blocks: count.div_ceil(256).clamp(1, BLOCKS_MAX), threads: 256, shared_bytes: 0 }
+    }
+
+    /// A warp for each of `count` rows.
+    #[must_use]
+    pub fn warps(count: usize) -> Self {
+        Self { blocks: count.div_ceil(4).clamp(1, BLOCKS_MAX), threads: 128, shared_bytes: 0 }
+    }
+
+    /// A warp a row, or a block where rows are few and wide; whether it is a block.
+    #[must_use]
+    pub fn rows(rows: usize, width: usize) -> (Self, bool) {
+        if rows <= 264 && width > 64 {
+            (Self { blocks: rows, threads: 256.min(width.next_multiple_of(32)), shared_bytes: 0 }, true)
+        } else {
+            (Self::warps(rows), false)
+        }
+    }
+}
+
+/// One command.
+#[derive(Debug, Clone, PartialEq)]
+pub enum Command {
+    /// A kernel with its arguments.
+    Kernel {
+        /// Which.
+        kernel: Kernel,
+        /// Over what.
+        grid: Grid,
+        /// Addresses.
+        p: Vec<Pointer>,
+        /// Counts.
+        n: Vec<i64>,
+        /// Factors.
+        f: Vec<f32>,
+    },
+    /// `c = a b + beta c`, row by row: a [m, k] or its transpose, b [k, n] or its transpose.
+    Product(Product),
+}
+
+/// A matrix product; `transposed` means that the matrix lies the other way round.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct Product {
+    /// [m, k], or [k, m] transposed.
+    pub a: Matrix,
+    /// Whether a lies the other way round.
+    pub a_transposed: bool,
+    /// [k, n], or [n, k] transposed.
+    pub b: Matrix,
+    /// Whether b lies the other way round.
+    pub b_transposed: bool,
+    /// [m, n].
+    pub c: Matrix,
+    /// Whether the product is added to c.
+    pub add: bool,
+}
+
+impl Product {
+    /// m, n, k.
+    #[must_use]
+    pub fn sizes(&self) -> (usize, usize, usize) {
+        (self.c.rows, self.c.cols, if self.a_transposed { self.a.rows } else { self.a.cols })
+    }
+}
+
+/// A list of commands under way.
+#[derive(Debug, Default)]
+pub struct Program {
+    commands: Vec<(u16, Command)>,
+    parts: Vec<&'static str>,
+    sizes: Vec<usize>,
+    part: u16,
+}
+
+/// A program whose buffers have addresses.
+#[derive(Debug)]
+pub struct Finished {
+    /// Which part of `parts` each command belongs to, and the command with fixed places alone.
+    pub commands: Vec<(u16, Command)>,
+    /// Names of parts.
+    pub parts: Vec<&'static str>,
+    /// Memory its buffers take together.
+    pub bytes: usize,
+}
+
+/// Memory that programs use one after the other.
+#[derive(Debug, Default)]
+pub struct Arena {
+    address: u64,
+    bytes: usize,
+}
+
+const ALIGNMENT: usize = 256;
+
+impl Program {
+    /// A buffer of this many numbers; its contents are undefined until something is written.
+    pub fn buffer(&mut self, numbers: usize) -> Place {
+        self.sizes.push((4 * numbers).next_multiple_of(ALIGNMENT));
+        Place::Transient(self.sizes.len() as u32 - 1)
+    }
+
+    /// Commands from now on belong to this part.
+    pub fn part(&mut self, name: &'static str) {
+        let known = self.parts.iter().position(|part| *part == name);
+        self.part = known.unwrap_or(self.parts.len()) as u16;
+        if known.is_none() {
+            self.parts.push(name);
+        }
+    }
+
+    /// The name of the part that commands belong to now.
+    #[must_use]
+    pub fn current_part(&self) -> &'static str {
+        self.parts.get(usize::from(self.part)).copied().unwrap_or_default()
+    }
+
+    /// Adds a kernel.
+    pub fn kernel(&mut self, kernel: Kernel, grid: Grid, p: &[Pointer], n: &[usize], f: &[f32]) {
+        let n = n.iter().map(|n| *n as i64).collect();
+        self.push(Command::Kernel { kernel, grid, p: p.to_vec(), n, f: f.to_vec() });
+    }
+
+    /// Adds a matrix product.
+    pub fn product(&mut self, product: Product) {
+        let (m, n, k) = product.sizes();
+        let a = if product.a_transposed { (product.a.cols, product.a.rows) } else { (product.a.rows, product.a.cols) };
+        let b = if product.b_transposed { (product.b.cols, product.b.rows) } else { (product.b.rows, product.b.cols) };
+        assert!(a == (m, k) && b == (k, n), "{a:?} x {b:?} is not {m} x {n}");
+        self.push(Command::Product(product));
+    }
+
+    fn push(&mut self, command: Command) {
+        if self.parts.is_empty() {
+            self.parts.push("other");
+        }
+        self.commands.push((self.part, command));
+    }
+
+    /// Gives every buffer an address: buffers whose first and last uses do not overlap share memory. `arena` grows where it is too small,
+    /// so all programs of an arena must be finished before the first one is run.
+    pub fn layout(&self) -> (Vec<usize>, usize) {
+        let mut lives: Vec<Option<(usize, usize)>> = vec![None; self.sizes.len()];
+        for (at, (_, command)) in self.commands.iter().enumerate() {
+            each_place(command, |place| {
+                if let Place::Transient(id) = place {
+                    let life = lives[id as usize].get_or_insert((at, at));
+                    life.1 = at;
+                }
+            });
+        }
+        let mut order: Vec<usize> = (0..self.sizes.len()).filter(|id| lives[*id].is_some()).collect();
+        // Large buffers first: small ones fill the gaps between them.
+        order.sort_by_key(|id| std::cmp::Reverse(self.sizes[*id]));
+        let (mut offsets, mut placed): (Vec<usize>, Vec<usize>) = (vec![0; self.sizes.len()], Vec::new());
+        let mut total = 0;
+        for id in order {
+            let Some((from, to)) = lives[id] else { continue };
+            let mut taken: Vec<(usize, usize)> = placed
+                .iter()
+                .filter(|other| lives[**other].is_some_and(|(first, last)| first <= to && from <= last))
+                .map(|other| (offsets[*other], offsets[*other] + self.sizes[*other]))
+                .collect();
+            taken.sort_unstable();
+            let mut offset = 0;
+            for (begin, end) in taken {
+                if begin >= offset + self.sizes[id] {
+                    break;
+                }
+                offset = offset.max(end);
+            }
+            offsets[id] = offset;
+            total = total.max(offset + self.sizes[id]);
+            placed.push(id);
+        }
+        (offsets, total)
+    }
+
+    /// The program with addresses in `arena`, which is large enough for its [`Program::layout`].
+    #[must_use]
+    pub fn finish(self, offsets: &[usize], bytes: usize, arena: &Arena) -> Finished {
+        assert!(bytes <= arena.bytes, "the arena was made for smaller programs");
+        let fix = |place: Place| match place {
+            Place::Fixed(address) => Place::Fixed(address),
+            Place::Transient(id) => Place::Fixed(arena.address + offsets[id as usize] as u64),
+        };
+        let matrix = |m: Matrix| Matrix { place: fix(m.place), ..m };
+        let commands = self.commands.into_iter().map(|(part, command)| {
+            let command = match command {
+                Command::Kernel { kernel, grid, p, n, f } => {
+                    let p = p.into_iter().map(|p| Pointer { place: p.place.map(fix), ..p }).collect();
+                    Command::Kernel { kernel, grid, p, n, f }
+                }
+                Command::Product(p) => {
+                    Command::Product(Product { a: matrix(p.a), b: matrix(p.b), c: matrix(p.c), ..p })
+                }
+            };
+            (part, command)
+        });
+        Finished { commands: commands.collect(), parts: self.parts, bytes }
+    }
+}
+
+impl Arena {
+    /// Memory for programs of at most this many bytes.
+    ///
+    /// # Errors
+    /// [`GpuError`] if there is not as much.
+    pub fn new(machine: &mut Machine, bytes: usize) -> Result<Self, GpuError> {
+        Ok(Self { address: machine.allocate(bytes.max(ALIGNMENT))?, bytes })
+    }
+}
+
+fn each_place(command: &Command, mut look: impl FnMut(Place)) {
+    match command {
+        Command::Kernel { p, .. } => p.iter().filter_map(|p| p.place).for_each(look),
+        Command::Product(p) => [p.a, p.b, p.c].iter().for_each(|m| look(m.place)),
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn buffers_share_memory_only_where_their_lives_do_not_meet() {
+        let mut program = Program::default();
+        let [a, b, c] = [program.buffer(1000), program.buffer(1000), program.buffer(1000)];
+        let m = |place| Matrix { place, offset: 0, rows: 10, cols: 100, stride: 100 };
+        let copy = |program: &mut Program, x: Place, y: Place| {
+            program.kernel(Kernel::CopyRows, Grid::elements(1000), &[m(x).into(), m(y).into()], &[], &[]);
+        };
+        copy(&mut program, a, b);
+        copy(&mut program, b, c);
+        let (offsets, bytes) = program.layout();
+        assert_eq!(offsets[0], offsets[2], "a is dead when c is born");
+        assert_ne!(offsets[0], offsets[1]);
+        assert_eq!(bytes, 2 * 4096);
+    }
+}

@@ -1,0 +1,162 @@
+//! Gradients on programs: an op adds its commands and says what to add when gradients come back.
+
+use std::collections::HashMap;
+
+use crate::machine::Kernel;
+use crate::program::{Grid, Matrix, Place, Pointer, Product, Program};
+
+type Backward = Box<dyn FnOnce(&mut Tape)>;
+
+/// A program with the way back.
+#[derive(Default)]
+pub struct Tape {
+    /// The commands so far.
+    pub program: Program,
+    sizes: HashMap<Place, usize>,
+    gradients: HashMap<Place, Gradient>,
+    backward: Vec<(&'static str, Backward)>,
+    detached: bool,
+}
+
+#[derive(Clone, Copy)]
+struct Gradient {
+    place: Place,
+    written: bool,
+}
+
+impl Tape {
+    /// A matrix of its own, whose contents are undefined until something is written.
+    pub fn matrix(&mut self, rows: usize, cols: usize) -> Matrix {
+        let place = self.program.buffer(rows * cols);
+        self.sizes.insert(place, rows * cols);
+        Matrix { place, offset: 0, rows, cols, stride: cols }
+    }
+
+    /// Says what to add backward, in the part that is current now.
+    pub fn on_backward(&mut self, body: impl FnOnce(&mut Self) + 'static) {
+        if !self.detached {
+            self.backward.push((self.program.current_part(), Box::new(body)));
+        }
+    }
+
+    /// Adds ops that no gradient goes back through.
+    pub fn without_gradient<T>(&mut self, body: impl FnOnce(&mut Self) -> T) -> T {
+        let before = std::mem::replace(&mut self.detached, true);
+        let result = body(self);
+        self.detached = before;
+        result
+    }
+
+    /// Adds the way back, from the last op to the first.
+    pub fn run_backward(&mut self) {
+        while let Some((part, body)) = self.backward.pop() {
+            self.program.part(part);
+            body(self);
+        }
+    }
+
+    fn gradient(&mut self, place: Place) -> Gradient {
+        if let Some(gradient) = self.gradients.get(&place) {
+            return *gradient;
+        }
+        let numbers = self.sizes.get(&place).copied().expect("only matrices of the tape have gradients");
+        let gradient = Gradient { place: self.program.buffer(numbers), written: false };
+        self.gradients.insert(place, gradient);
+        gradient
+    }
+
+    fn written(&mut self, place: Place) {
+        if let Some(gradient) = self.gradients.get_mut(&place) {
+            gradient.written = true;
+        }
+    }
+
+    /// Where a term of x's gradient goes, and whether it is to be added to what is there.
+    pub fn gradient_term(&mut self, x: Matrix) -> (Matrix, bool) {
+        let gradient = self.gradient(x.place);
+        let whole = x.is_contiguous() && Some(&x.len()) == self.sizes.get(&x.place);
+        if !gradient.written && !whole {
+            self.zero_gradient(x.place);
+        }
+        self.written(x.place);
+        (Matrix { place: gradient.place, ..x }, gradient.written || !whole)
+    }
+
+    /// Where x's gradient is written by a kernel that never adds: all of the buffer must be written so before it is read.
+    pub fn gradient_overwritten(&mut self, x: Matrix) -> Matrix {
+        let gradient = self.gradient(x.place);
+        self.written(x.place);
+        Matrix { place: gradient.place, ..x }
+    }
+
+    /// Gradients may reach this matrix at a fixed address.
+    pub fn track(&mut self, x: Matrix) {
+        self.sizes.insert(x.place, x.len());
+    }
+
+    /// Where a term of x's gradient is added, by a kernel that always adds.
+    pub fn gradient_sum(&mut self, x: Matrix) -> Matrix {
+        let gradient = self.gradient(x.place);
+        if !gradient.written {
+            self.zero_gradient(x.place);
+            self.written(x.place);
+        }
+        Matrix { place: gradient.place, ..x }
+    }
+
+    /// The gradient of x, all of whose terms have been added.
+    pub fn gradient_of(&mut self, x: Matrix) -> Matrix {
+        self.gradient_sum(x)
+    }
+
+    fn zero_gradient(&mut self, place: Place) {
+        let (numbers, gradient) = (self.sizes[&place], self.gradient(place));
+        let all = Matrix { place: gradient.place, offset: 0, rows: 1, cols: numbers, stride: numbers };
+        self.zero(all);
+    }
+
+    /// x = 0.
+    pub fn zero(&mut self, x: Matrix) {
+        self.program.kernel(Kernel::Zero, Grid::elements(x.len()), &[x.into()], &[x.rows, x.cols, x.stride], &[]);
+    }
+
+    /// y = factor x, or added to y.
+    pub fn copy(&mut self, x: Matrix, y: Matrix, add: bool, factor: f32) {
+        let n = [x.rows, x.cols, x.stride, y.stride, usize::from(add)];
+        self.program.kernel(Kernel::CopyRows, Grid::elements(x.len()), &[x.into(), y.into()], &n, &[factor]);
+    }
+
+    /// `c = a b`, each perhaps transposed, or added to c.
+    pub fn product(&mut self, a: (Matrix, bool), b: (Matrix, bool), c: Matrix, add: bool) {
+        self.program.product(Product { a: a.0, a_transposed: a.1, b: b.0, b_transposed: b.1, c, add });
+    }
+
+    /// Adds the sums of columns of x [rows, width] to `out` [width].
+    pub fn add_column_sums(&mut self, x: Matrix, out: Matrix) {
+        // Narrow matrices are summed as wider ones: 8 rows of 4 are a row of 32.
+        let fold = if x.is_contiguous() && x.cols < 32 && 32 % x.cols == 0 && x.rows.is_multiple_of(32 / x.cols) {
+            32 / x.cols
+        } else {
+            1
+        };
+        let wide = if fold > 1 { x.reshape(x.rows / fold, 32) } else { x };
+        let (chunks, rows) = chunks_of(wide.rows);
+        let partial = self.matrix(chunks, wide.cols);
+        let grid = Grid { blocks: chunks * wide.cols.div_ceil(32), threads: 256, shared_bytes: 0 };
+        let n = [wide.rows, wide.cols, wide.stride, rows];
+        self.program.kernel(Kernel::ColumnSums, grid, &[wide.into(), partial.into()], &n, &[]);
+        self.add_partials(partial.pointer(), out, chunks * fold, x.cols, 0);
+    }
+
+    /// Adds up shares: `out[j] += sum over chunks of partial[chunk * distance + offset + j]`.
+    pub fn add_partials(&mut self, partial: Pointer, out: Matrix, chunks: usize, distance: usize, offset: usize) {
+        let n = [chunks, out.len(), distance, offset];
+        self.program.kernel(Kernel::SumPartials, Grid::elements(out.len()), &[partial, out.into()], &n, &[]);
+    }
+}
+
+/// Chunks that so many rows are summed in, and the rows of each.
+pub fn chunks_of(rows: usize) -> (usize, usize) {
+    let each = rows.div_ceil(256).max(32);
+    (rows.div_ceil(each), each)
+}

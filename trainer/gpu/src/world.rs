@@ -1,0 +1,659 @@
+//! The world model's update (eq. 2, 3, 5 to 9) as a program: encode, scan, decode, losses, and the way back.
+
+use rcwm_models::settings::{ModelKind, ModelSettings};
+
+use crate::layers::{Attending, Dense, Draw, Interaction, Linear, Norm, Source, Store, Weight};
+use crate::machine::Kernel;
+use crate::program::{Grid, Matrix, Pointer};
+use crate::tape::Tape;
+
+/// Sizes of a batch and of the model.
+#[derive(Debug, Clone)]
+pub struct Sizes {
+    /// The model.
+    pub model: ModelSettings,
+    /// B, sequences.
+    pub batch: usize,
+    /// T, steps of a sequence.
+    pub length: usize,
+    /// Of so many steps one is painted.
+    pub paint_every: usize,
+}
+
+impl Sizes {
+    /// B T.
+    #[must_use]
+    pub fn rows(&self) -> usize {
+        self.batch * self.length
+    }
+
+    /// Rows that are painted.
+    #[must_use]
+    pub fn painted(&self) -> usize {
+        self.batch * self.length / self.paint_every
+    }
+
+    /// Branches of the model.
+    #[must_use]
+    pub fn branches(&self) -> usize {
+        match self.model.kind {
+            ModelKind::Rcwm => 2,
+            ModelKind::Vanilla => 1,
+        }
+    }
+
+    /// n m.
+    #[must_use]
+    pub fn z(&self) -> usize {
+        self.model.stoch_width()
+    }
+
+    /// Columns of a branch's z and h in the features.
+    #[must_use]
+    pub fn columns(&self, branch: usize) -> (std::ops::Range<usize>, std::ops::Range<usize>) {
+        let (z, h) = (self.z(), self.model.deter);
+        let from = branch * (z + h);
+        (from..from + z, from + z..from + z + h)
+    }
+
+    /// Columns of the features.
+    #[must_use]
+    pub fn state(&self) -> usize {
+        self.branches() * (self.z() + self.model.deter)
+    }
+
+    /// Draws of z a step of the scan.
+    #[must_use]
+    pub fn draws(&self) -> usize {
+        2 * self.branches() - 1
+    }
+
+    /// Words of noise that the update takes; the CPU draws the last prior of all rows too, which no loss needs.
+    #[must_use]
+    pub fn words(&self) -> u64 {
+        ((self.draws() + 1) * self.rows() * self.z()) as u64
+    }
+
+    /// Draws of this model's categoricals.
+    #[must_use]
+    pub fn draw(&self, major: Option<(usize, usize)>) -> Draw {
+        Draw { classes: self.model.classes, unimix: self.model.unimix as f32, major }
+    }
+}
+
+/// What the losses are multiplied with.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct WorldScales {
+    /// Of the image.
+    pub image: f32,
+    /// Of the robot's mask.
+    pub mask: f32,
+    /// Of the reward.
+    pub reward: f32,
+    /// Of the continuation.
+    pub continues: f32,
+    /// Of KL[sg(q) || p].
+    pub dynamics: f32,
+    /// Of KL[q || sg(p)].
+    pub representation: f32,
+    /// KL below which nothing is learned.
+    pub free_nats: f32,
+}
+
+/// Where a batch lies on the machine; rows are time-major.
+#[derive(Debug, Clone, Copy)]
+pub struct Inputs {
+    /// Images u8 [.., 64, 64, 3], of a batch or of a store.
+    pub images: u64,
+    /// Masks u8 [.., 64, 64], as the images.
+    pub masks: u64,
+    /// Which image each row has, u32 [T B].
+    pub index: u64,
+    /// Shift of each sequence's images, i32 [B, 2]: right, down.
+    pub shift: u64,
+    /// Actions that led to the images, divided by max(1, |a|) and zero where an episode begins: [T B, action].
+    pub action: u64,
+    /// [T B].
+    pub reward: u64,
+    /// [T B].
+    pub terminal: u64,
+    /// u32 [T B].
+    pub first: u64,
+    /// Rows that are painted, u32.
+    pub painted: u64,
+    /// Key and stream of the noise, u32 [10].
+    pub noise: u64,
+}
+
+/// Losses on the machine, each a number: image, mask, reward, continue, and for each branch its KL and its KL raised to the free nats.
+pub const SCALARS: usize = 8;
+
+/// One branch's layers.
+#[derive(Debug, Clone, Copy)]
+pub struct Branch {
+    input: Dense,
+    cell: Weight,
+    cell_norm: Norm,
+    prior: Dense,
+    prior_logits: Linear,
+    posterior: [Weight; 2],
+    posterior_norm: Norm,
+    posterior_logits: Linear,
+    initial: Weight,
+}
+
+impl Branch {
+    /// The branch of this name: `robot`, `environment` or vanilla's `dynamics`.
+    #[must_use]
+    pub fn new(source: Source<'_>, name: &str, model: &ModelSettings) -> Self {
+        let at = |part: &str| format!("{name}.{part}");
+        let posterior = source.dense(&at("posterior.dense"));
+        let (d, width) = (model.deter, posterior.weight.value.cols);
+        Self {
+            input: source.dense(&at("input")),
+            cell: source.weight(&at("cell.linear.weight")),
+            cell_norm: source.norm(&at("cell.norm")),
+            prior: source.dense(&at("prior.dense")),
+            prior_logits: source.linear(&at("prior.logits")),
+            posterior: [posterior.weight.columns(0..d), posterior.weight.columns(d..width)],
+            posterior_norm: posterior.norm,
+            posterior_logits: source.linear(&at("posterior.logits")),
+            initial: source.weight(&at("initial")),
+        }
+    }
+}
+
+/// What the recurrence of a branch works in, all rows.
+#[derive(Debug, Clone, Copy)]
+pub struct Recurrence {
+    /// Input of the branch [rows, input].
+    pub input: Matrix,
+    /// Input layer's output beside h_{t-1}: [rows, hidden + d].
+    pub joined: Matrix,
+    pre: Matrix,
+    stats: Matrix,
+    cell: Matrix,
+    cell_stats: Matrix,
+    gates: Matrix,
+    hidden: usize,
+}
+
+impl Recurrence {
+    /// Room for so many rows; collects the weights' gradients over all of them.
+    pub fn new(tape: &mut Tape, branch: &Branch, rows: usize) -> Self {
+        let (hidden, d) = (branch.input.weight.value.rows, branch.initial.value.cols);
+        let room = Self {
+            input: tape.matrix(rows, branch.input.weight.value.cols),
+            joined: tape.matrix(rows, hidden + d),
+            pre: tape.matrix(rows, hidden),
+            stats: tape.matrix(rows, 2),
+            cell: tape.matrix(rows, 3 * d),
+            cell_stats: tape.matrix(rows, 2),
+            gates: tape.matrix(rows, 3 * d),
+            hidden,
+        };
+        tape.collect_linear(room.input, branch.input.weight, room.pre);
+        tape.collect_norm(room.pre, branch.input.norm, room.stats, room.joined.columns(0..hidden), true);
+        tape.collect_linear(room.joined, branch.cell, room.cell);
+        if branch.cell.gradient.is_some() {
+            tape.collect_cell(room.cell, branch.cell_norm, room.cell_stats, room.gates);
+        }
+        room
+    }
+
+    /// Where h_{t-1} goes.
+    #[must_use]
+    pub fn before(&self) -> Matrix {
+        self.joined.columns(self.hidden..self.joined.cols)
+    }
+
+    /// h_t of some rows (eq. 5, 6).
+    pub fn step(&self, tape: &mut Tape, branch: &Branch, rows: std::ops::Range<usize>, h: Matrix) {
+        let at = |matrix: Matrix| matrix.rows(rows.clone());
+        let x = at(self.joined.columns(0..self.hidden));
+        tape.linear(at(self.input), branch.input.weight, at(self.pre), false);
+        tape.linear_back(at(self.input), branch.input.weight, at(self.pre));
+        tape.norm_step(at(self.pre), branch.input.norm, at(self.stats), x, true);
+        tape.linear(at(self.joined), branch.cell, at(self.cell), false);
+        tape.linear_back(at(self.joined), branch.cell, at(self.cell));
+        let (cell, stats, gates) = (at(self.cell), at(self.cell_stats), at(self.gates));
+        tape.cell_step(cell, branch.cell_norm, stats, gates, at(self.before()), h);
+    }
+}
+
+/// What a latent head works in, all rows: a dense block and logits.
+#[derive(Debug, Clone, Copy)]
+pub struct Head {
+    weight: Weight,
+    norm: Norm,
+    out: Linear,
+    pre: Matrix,
+    stats: Matrix,
+    inner: Matrix,
+    /// [rows, n m].
+    pub logits: Matrix,
+    adds: bool,
+}
+
+impl Head {
+    /// Room for rows of h [rows, d]; collects the weights' gradients over all of them. `pre` is there where the sum before the norm has
+    /// another term already.
+    fn new(tape: &mut Tape, (weight, norm, out): (Weight, Norm, Linear), h: Matrix, pre: Option<Matrix>) -> Self {
+        let (rows, hidden) = (h.rows, weight.value.rows);
+        let adds = pre.is_some();
+        let pre = pre.unwrap_or_else(|| tape.matrix(rows, hidden));
+        let (stats, inner) = (tape.matrix(rows, 2), tape.matrix(rows, hidden));
+        let logits = tape.matrix(rows, out.weight.value.rows);
+        tape.collect_linear(h, weight, pre);
+        tape.collect_norm(pre, norm, stats, inner, true);
+        tape.collect_linear(inner, out.weight, logits);
+        tape.fill_bias(out.bias, logits);
+        Self { weight, norm, out, pre, stats, inner, logits, adds }
+    }
+
+    /// The prior's head.
+    pub fn prior(tape: &mut Tape, branch: &Branch, h: Matrix) -> Self {
+        Self::new(tape, (branch.prior.weight, branch.prior.norm, branch.prior_logits), h, None)
+    }
+
+    /// Logits of some rows.
+    pub fn step(&self, tape: &mut Tape, h: Matrix, rows: std::ops::Range<usize>) -> Matrix {
+        let at = |matrix: Matrix| matrix.rows(rows.clone());
+        tape.linear(h, self.weight, at(self.pre), self.adds);
+        tape.linear_back(h, self.weight, at(self.pre));
+        tape.norm_step(at(self.pre), self.norm, at(self.stats), at(self.inner), true);
+        tape.linear(at(self.inner), self.out.weight, at(self.logits), true);
+        tape.linear_back(at(self.inner), self.out.weight, at(self.logits));
+        at(self.logits)
+    }
+}
+
+/// What the interaction works in, all rows.
+#[derive(Debug, Clone, Copy)]
+pub struct Interacting {
+    parts: Interaction,
+    all: Attending,
+    classes: usize,
+}
+
+impl Interacting {
+    /// Room for rows; e goes to `e` [rows, n m] and h^R comes from `h` [rows, d]. Collects the weights' gradients over all of them.
+    pub fn new(tape: &mut Tape, source: Source<'_>, model: &ModelSettings, e: Matrix, h: Matrix) -> Self {
+        let parts = source.interaction();
+        let (rows, nm, m) = (e.rows, model.stoch_width(), model.classes);
+        let wide = nm + model.interaction_rows() * m;
+        let trained = parts.deter.weight.gradient.is_some();
+        let (n, r) = (nm / m, wide / m);
+        let store = trained.then(|| Store {
+            at: tape.matrix(1, 2 * rows * (n + r) * m),
+            distances: [rows * nm, 2 * rows * nm, 2 * rows * nm + rows * wide],
+        });
+        let all = Attending {
+            z: tape.matrix(rows, nm),
+            u: tape.matrix(rows, wide),
+            e,
+            mix: trained.then(|| tape.matrix(rows, nm)),
+            sum: trained.then(|| tape.matrix(rows, nm)),
+            stats: tape.matrix(rows * n, 2),
+            store,
+        };
+        let g = all.u.columns(nm..wide);
+        tape.collect_linear(h, parts.deter.weight, g);
+        tape.fill_bias(parts.deter.bias, g);
+        tape.collect_interaction(&parts, m, all);
+        Self { parts, all, classes: m }
+    }
+
+    /// Where the environment's z_{t-1} goes.
+    #[must_use]
+    pub fn z(&self) -> Matrix {
+        self.all.z
+    }
+
+    /// Where the robot's prior z_t goes.
+    #[must_use]
+    pub fn prior_z(&self) -> Matrix {
+        self.all.u.columns(0..self.all.z.cols)
+    }
+
+    /// e_{t-1} of some rows (eq. 7).
+    pub fn step(&self, tape: &mut Tape, h: Matrix, rows: std::ops::Range<usize>) {
+        let (nm, n) = (self.all.z.cols, self.all.z.cols / self.classes);
+        let at = |matrix: Matrix| matrix.rows(rows.clone());
+        let u = at(self.all.u);
+        let g = u.columns(nm..u.cols);
+        tape.linear(h, self.parts.deter.weight, g, true);
+        tape.linear_back(h, self.parts.deter.weight, g);
+        // The parts of the store are laid out by all rows; this step's begin further on in each.
+        let store = self.all.store.map(|store| {
+            let (z, r) = (rows.start * nm, rows.start * (u.cols - nm));
+            let [q, k, v] = store.distances;
+            let at = Matrix { offset: store.at.offset + z, cols: store.at.cols - z, ..store.at };
+            Store { at, distances: [q, k + r, v + r] }
+        });
+        let here = Attending {
+            z: at(self.all.z),
+            u,
+            e: at(self.all.e),
+            mix: self.all.mix.map(at),
+            sum: self.all.sum.map(at),
+            stats: self.all.stats.rows(rows.start * n..rows.end * n),
+            store,
+        };
+        tape.interaction_step(&self.parts, self.classes, here);
+    }
+}
+
+/// Gumbel or normal noise from word `from` on.
+pub fn noise(tape: &mut Tape, control: u64, rows: usize, cols: usize, normal: bool, from: u64) -> Matrix {
+    let out = tape.matrix(rows, cols);
+    let blocks = (out.len() * if normal { 2 } else { 1 }).div_ceil(16) + 1;
+    let p = [Matrix::fixed(control, 1, 10).into(), out.into()];
+    let n = [out.len(), usize::from(normal), from as usize];
+    tape.program.kernel(Kernel::Noise, Grid::elements(blocks), &p, &n, &[]);
+    out
+}
+
+/// Adds the losses of a batch and all gradients of the world model; the posterior states go to `features` [T B, state], the losses to
+/// `scalars` [`SCALARS`].
+pub fn losses(
+    tape: &mut Tape,
+    source: Source<'_>,
+    sizes: &Sizes,
+    inputs: Inputs,
+    (scales, masks): (WorldScales, bool),
+    (features, scalars): (Matrix, Matrix),
+) {
+    tape.track(features);
+    tape.program.part("gather");
+    let images = gather(tape, sizes, inputs.images, inputs, 3);
+    let masks = masks.then(|| gather(tape, sizes, inputs.masks, inputs, 1));
+    tape.program.part("encode");
+    let embeds = encode(tape, source, sizes, images);
+    tape.program.part("scan");
+    let pairs = scan(tape, source, sizes, inputs, &embeds, features);
+    tape.program.part("decode");
+    painted(tape, source, sizes, inputs, (images, masks, features), scales, scalars);
+    tape.program.part("heads");
+    other_losses(tape, source, sizes, inputs, &pairs, scales, (features, scalars));
+    tape.run_backward();
+}
+
+/// The batch's images as floats [T B 64 64, 3], or masks as bytes.
+fn gather(tape: &mut Tape, sizes: &Sizes, from: u64, inputs: Inputs, channels: usize) -> Matrix {
+    let rows = sizes.rows();
+    let masks = channels == 1;
+    let out = if masks { tape.matrix(rows, 1024) } else { tape.matrix(rows * 4096, 3) };
+    let fixed = |address: u64| Pointer::from(Matrix::fixed(address, 1, 1));
+    let p = [fixed(from), fixed(inputs.index), fixed(inputs.shift), out.into()];
+    let n = [rows, sizes.batch, channels, usize::from(masks)];
+    tape.program.kernel(Kernel::GatherImages, Grid::elements(rows * 4096 * channels), &p, &n, &[]);
+    out
+}
+
+fn encode(tape: &mut Tape, source: Source<'_>, sizes: &Sizes, images: Matrix) -> Vec<Matrix> {
+    let layer = |tape: &mut Tape, x: Matrix, side: usize, name: String, reaches: bool| {
+        let (weight, norm) = (source.weight(&format!("{name}.conv.weight")), source.norm(&format!("{name}.norm")));
+        tape.conv_down(x, side, weight, norm, reaches)
+    };
+    let flat = |x: Matrix| x.reshape(x.rows / 16, 16 * x.cols);
+    match sizes.model.kind {
+        ModelKind::Rcwm => {
+            let x = layer(tape, images, 64, "encoder.shared.0".into(), false);
+            let x = layer(tape, x, 32, "encoder.shared.1".into(), true);
+            let mut branch = |name: &str| {
+                let x = layer(tape, x, 16, format!("encoder.{name}.0"), true);
+                flat(layer(tape, x, 8, format!("encoder.{name}.1"), true))
+            };
+            ["robot", "environment"].map(&mut branch).to_vec()
+        }
+        ModelKind::Vanilla => {
+            let x = (0..4).fold(images, |x, i| layer(tape, x, 64 >> i, format!("encoder.{i}"), i > 0));
+            vec![flat(x)]
+        }
+    }
+}
+
+/// Names of the model's branches, as parameters have them.
+#[must_use]
+pub fn branch_names(kind: ModelKind) -> &'static [&'static str] {
+    match kind {
+        ModelKind::Rcwm => &["robot", "environment"],
+        ModelKind::Vanilla => &["dynamics"],
+    }
+}
+
+/// Filters the batch: logits of posterior and prior of each branch, all rows.
+fn scan(
+    tape: &mut Tape,
+    source: Source<'_>,
+    sizes: &Sizes,
+    inputs: Inputs,
+    embeds: &[Matrix],
+    features: Matrix,
+) -> Vec<(Matrix, Matrix)> {
+    let (b, rows, nm) = (sizes.batch, sizes.rows(), sizes.z());
+    let draws = sizes.draws();
+    let gumbel = noise(tape, inputs.noise, draws * rows, nm, false, 0);
+    let gumbel = move |t: usize, which: usize| {
+        let from = (t * draws + which) * b;
+        Some(gumbel.rows(from..from + b))
+    };
+    let draw = sizes.draw(None);
+    let branches: Vec<Branch> = branch_names(sizes.model.kind)
+        .iter()
+        .map(|name| Branch::new(source, name, &sizes.model))
+        .collect();
+    let columns: Vec<_> = (0..branches.len()).map(|branch| sizes.columns(branch)).collect();
+    let h_of = |branch: usize| features.columns(columns[branch].1.clone());
+    let z_of = |branch: usize| features.columns(columns[branch].0.clone());
+
+    // What collects over all rows comes first: backward it is last.
+    let initial: Vec<(Matrix, Matrix)> = branches
+        .iter()
+        .map(|branch| {
+            let h = tape.tanh(branch.initial);
+            let head = Head::prior(tape, branch, h);
+            let logits = head.step(tape, h, 0..1);
+            let z = tape.matrix(1, nm);
+            tape.draw(logits, None, z, draw);
+            (z, h)
+        })
+        .collect();
+    let rooms: Vec<Recurrence> = branches.iter().map(|branch| Recurrence::new(tape, branch, rows)).collect();
+    let posteriors: Vec<Head> = branches
+        .iter()
+        .enumerate()
+        .map(|(at, branch)| {
+            let [of_h, of_embed] = branch.posterior;
+            let pre = tape.matrix(rows, of_embed.value.rows);
+            tape.collect_linear(embeds[at], of_embed, pre);
+            tape.linear(embeds[at], of_embed, pre, false);
+            tape.linear_back(embeds[at], of_embed, pre);
+            Head::new(tape, (of_h, branch.posterior_norm, branch.posterior_logits), h_of(at), Some(pre))
+        })
+        .collect();
+    let interaction = (branches.len() == 2).then(|| {
+        let head = Head::prior(tape, &branches[0], h_of(0));
+        (head, Interacting::new(tape, source, &sizes.model, rooms[1].input, h_of(0)))
+    });
+    let actions = Matrix::fixed(inputs.action, rows, sizes.model.action);
+    tape.copy(actions, rooms[0].input.columns(nm..nm + sizes.model.action), false, 1.0);
+
+    for t in 0..sizes.length {
+        let here = t * b..(t + 1) * b;
+        let first = Matrix::fixed(inputs.first, rows, 1).rows(here.clone());
+        let carried = |x: Matrix| (t > 0).then(|| x.rows((t - 1) * b..t * b));
+        let at = |x: Matrix| x.rows(here.clone());
+        for branch in 0..branches.len() {
+            let (z, h) = initial[branch];
+            let into = match (&interaction, branch) {
+                (Some((_, interaction)), 1) => interaction.z(),
+                _ => rooms[0].input.columns(0..nm),
+            };
+            tape.carry(first, z, carried(z_of(branch)), at(into));
+            tape.carry(first, h, carried(h_of(branch)), at(rooms[branch].before()));
+        }
+        rooms[0].step(tape, &branches[0], here.clone(), at(h_of(0)));
+        let mut which = 0;
+        let mut next = || {
+            which += 1;
+            gumbel(t, which - 1)
+        };
+        if let Some((prior, interaction)) = &interaction {
+            let logits = prior.step(tape, at(h_of(0)), here.clone());
+            tape.draw(logits, next(), at(interaction.prior_z()), draw);
+        }
+        let logits = posteriors[0].step(tape, at(h_of(0)), here.clone());
+        tape.draw(logits, next(), at(z_of(0)), draw);
+        if let Some((_, interaction)) = &interaction {
+            interaction.step(tape, at(h_of(0)), here.clone());
+            rooms[1].step(tape, &branches[1], here.clone(), at(h_of(1)));
+            let logits = posteriors[1].step(tape, at(h_of(1)), here.clone());
+            tape.draw(logits, next(), at(z_of(1)), draw);
+        }
+    }
+    // Nothing in the scan needs the last branch's prior: its head runs once over all rows.
+    let last = branches.len() - 1;
+    let head = Head::prior(tape, &branches[last], h_of(last));
+    let last_prior = head.step(tape, h_of(last), 0..rows);
+    let mut priors: Vec<Matrix> = interaction.iter().map(|(prior, _)| prior.logits).collect();
+    priors.push(last_prior);
+    posteriors.iter().map(|head| head.logits).zip(priors).collect()
+}
+
+fn painted(
+    tape: &mut Tape,
+    source: Source<'_>,
+    sizes: &Sizes,
+    inputs: Inputs,
+    (images, masks, features): (Matrix, Option<Matrix>, Matrix),
+    scales: WorldScales,
+    scalars: Matrix,
+) {
+    let count = sizes.painted();
+    let index = Matrix::fixed(inputs.painted, 1, count);
+    let every = sizes.paint_every;
+    let chosen = if every == 1 {
+        features
+    } else {
+        let chosen = tape.matrix(count, features.cols);
+        let n = move |x: Matrix, back: usize| [count, x.cols, x.stride, chosen.stride, back];
+        let p = [features, chosen, index].map(Pointer::from);
+        tape.program.kernel(Kernel::GatherRows, Grid::elements(chosen.len()), &p, &n(features, 0), &[]);
+        tape.on_backward(move |tape| {
+            let dy = tape.gradient_of(chosen);
+            let dx = tape.gradient_sum(features);
+            let p = [dx, dy, index].map(Pointer::from);
+            tape.program.kernel(Kernel::GatherRows, Grid::elements(chosen.len()), &p, &n(dx, 1), &[]);
+        });
+        chosen
+    };
+    let prefixes: &[&str] = match sizes.model.kind {
+        ModelKind::Rcwm => &["decoder.robot", "decoder.environment"],
+        ModelKind::Vanilla => &["decoder"],
+    };
+    let raws: Vec<Matrix> = prefixes
+        .iter()
+        .enumerate()
+        .map(|(branch, prefix)| {
+            let (z, h) = sizes.columns(branch);
+            let map = tape.layer(chosen.columns(z.start..h.end), source.linear(&format!("{prefix}.linear")), true);
+            let mut x = map.reshape(count * 16, map.cols / 16);
+            for layer in 0..3 {
+                let name = format!("{prefix}.{layer}");
+                let pre = tape.conv_up(x, 4 << layer, source.weight(&format!("{name}.conv.weight")), None);
+                x = tape.matrix(pre.rows, pre.cols);
+                tape.norm(pre, source.norm(&format!("{name}.norm")), x, true);
+            }
+            let last = source.linear(&format!("{prefix}.3.conv"));
+            tape.conv_up(x, 32, last.weight, Some(last.bias))
+        })
+        .collect();
+    let (loss, mask_loss) = (tape.matrix(1, count), tape.matrix(1, count));
+    let d: Vec<Matrix> = raws.iter().map(|raw| tape.gradient_overwritten(*raw)).collect();
+    let two = |of: &[Matrix]| [Pointer::from(of[0]), of.get(1).copied().into()];
+    let rows: Pointer = if every == 1 { Pointer::NULL } else { index.into() };
+    let inputs = [images.into(), masks.into(), rows, loss.into(), mask_loss.into()];
+    let p = [&two(&raws)[..], &inputs, &two(&d)].concat();
+    let weights = [scales.image / count as f32, scales.mask / count as f32];
+    let grid = Grid { blocks: count, threads: 256, shared_bytes: 0 };
+    tape.program.kernel(Kernel::PictureLoss, grid, &p, &[count], &weights);
+    mean(tape, loss, scalars, 0, None);
+    if masks.is_some() {
+        mean(tape, mask_loss, scalars, 1, None);
+    }
+}
+
+/// The mean of numbers, each raised to a floor where there is one, to a place of the scalars.
+pub fn mean(tape: &mut Tape, x: Matrix, scalars: Matrix, at: usize, floor: Option<f32>) {
+    let p = [x.into(), scalars.columns(at..at + 1).into()];
+    let grid = Grid { blocks: 1, threads: 512, shared_bytes: 0 };
+    let n = [x.len(), usize::from(floor.is_some())];
+    tape.program.kernel(Kernel::SumOf, grid, &p, &n, &[1.0 / x.len() as f32, floor.unwrap_or_default()]);
+}
+
+fn other_losses(
+    tape: &mut Tape,
+    source: Source<'_>,
+    sizes: &Sizes,
+    inputs: Inputs,
+    pairs: &[(Matrix, Matrix)],
+    scales: WorldScales,
+    (features, scalars): (Matrix, Matrix),
+) {
+    let rows = sizes.rows();
+    let share = 1.0 / rows as f32;
+    let logits = tape.mlp(features, &source.mlp("heads.reward"), true);
+    let values = Matrix::fixed(inputs.reward, rows, 1);
+    let loss = tape.matrix(1, rows);
+    let target = Target { values, weight: None, add: false, factor: scales.reward * share };
+    two_hot_loss(tape, logits, target, loss, bins(source));
+    mean(tape, loss, scalars, 2, None);
+
+    let logits = tape.mlp(features, &source.mlp("heads.continue"), true);
+    let loss = tape.matrix(1, rows);
+    let d = tape.gradient_overwritten(logits);
+    let p = [logits, Matrix::fixed(inputs.terminal, rows, 1), loss, d].map(Pointer::from);
+    tape.program.kernel(Kernel::ContinueLoss, Grid::elements(rows), &p, &[rows], &[scales.continues * share]);
+    mean(tape, loss, scalars, 3, None);
+
+    let m = sizes.model.classes;
+    for (branch, (q, p)) in pairs.iter().enumerate() {
+        let kl = tape.matrix(1, rows);
+        let (dq, dp) = (tape.gradient_overwritten(*q), tape.gradient_overwritten(*p));
+        let pointers = [*q, *p, kl, dq, dp].map(Pointer::from);
+        let n = [rows, q.cols / m, m, q.stride, p.stride, dq.stride, dp.stride];
+        let unimix = sizes.model.unimix as f32;
+        let f = [unimix, scales.free_nats, scales.dynamics * share, scales.representation * share];
+        tape.program.kernel(Kernel::BalancedKl, Grid::warps(rows), &pointers, &n, &f);
+        mean(tape, kl, scalars, 4 + 2 * branch, None);
+        mean(tape, kl, scalars, 5 + 2 * branch, Some(scales.free_nats));
+    }
+}
+
+/// The two-hot bins [1, count], a constant beside the weights.
+pub fn bins(source: Source<'_>) -> Matrix {
+    source.weights.bins()
+}
+
+/// What a two-hot head is compared with.
+#[derive(Debug, Clone, Copy)]
+pub struct Target {
+    /// [rows, 1].
+    pub values: Matrix,
+    /// [rows], or 1 each.
+    pub weight: Option<Matrix>,
+    /// Whether loss and gradient are added to what is there.
+    pub add: bool,
+    /// What the gradient is multiplied with.
+    pub factor: f32,
+}
+
+/// Cross-entropy of logits [rows, bins] with two-hot distributions, with its gradient.
+pub fn two_hot_loss(tape: &mut Tape, logits: Matrix, target: Target, loss: Matrix, bins: Matrix) {
+    let d = tape.gradient_overwritten(logits);
+    let p = [logits.into(), target.values.into(), target.weight.into(), bins.into(), loss.into(), d.into()];
+    let n = [logits.rows, logits.cols, target.values.stride, usize::from(target.add)];
+    tape.program.kernel(Kernel::TwoHotLoss, Grid::warps(logits.rows), &p, &n, &[target.factor]);
+}

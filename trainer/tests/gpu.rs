@@ -1,0 +1,200 @@
+//! Updates as programs of kernels against the trainer's own: the kernels run on the host here, and on a GPU where there is one.
+
+#![allow(clippy::unwrap_used)]
+
+use std::collections::BTreeMap;
+
+use candle_core::{Device, Tensor};
+use rand::{Rng, SeedableRng};
+use rand_chacha::ChaCha8Rng;
+use rcwm_gpu::weights::Array;
+use rcwm_gpu::{Machine, Precision};
+use rcwm_models::settings::{ModelKind, ModelSettings, Preset};
+use rcwm_models::{ACTION_LEN, IMAGE_BYTES, MASK_BYTES};
+use rcwm_trainer::behaviour::{BehaviourLearner, BehaviourSettings, Horizon};
+use rcwm_trainer::gpu::{GpuLearner, GpuPlan, numbered_noise};
+use rcwm_trainer::learning::{HostBatch, Trained, WorldLearner, WorldSettings};
+use rcwm_trainer::model::agent;
+use rcwm_trainer::model::latent::Sampler;
+use rcwm_trainer::model::parameters::Parameters;
+
+const SEED: u64 = 11;
+
+/// Parameters away from their start, where the layers that begin at 0 let gradients through.
+fn lively_parameters(model: &ModelSettings) -> Parameters {
+    let parameters = agent::initialise(model, 1, &Device::Cpu).unwrap();
+    let mut generator = ChaCha8Rng::seed_from_u64(2);
+    for (_, var) in parameters.iter() {
+        let noise: Vec<f32> = (0..var.elem_count()).map(|_| generator.random_range(-0.05..0.05)).collect();
+        let noise = Tensor::from_vec(noise, var.dims(), &Device::Cpu).unwrap();
+        var.set(&(var.as_tensor() + noise).unwrap().detach()).unwrap();
+    }
+    parameters
+}
+
+fn batch(rows: usize, length: usize, masks: bool, number: u64) -> HostBatch {
+    let mut generator = ChaCha8Rng::seed_from_u64(3 + number);
+    let steps = rows * length;
+    let mut bytes =
+        |count: usize, most: u8| (0..count).map(|_| generator.random_range(0..=most)).collect::<Vec<u8>>();
+    let image = bytes(steps * IMAGE_BYTES, 255);
+    let robot_mask = if masks { bytes(steps * MASK_BYTES, 1) } else { Vec::new() };
+    let mut first = vec![false; steps];
+    first[0] = true;
+    first[steps - 1] = true;
+    first[steps / 2] = true;
+    let mut terminal = vec![false; steps];
+    terminal[1] = true;
+    HostBatch {
+        rows,
+        length,
+        image,
+        action: (0..steps * ACTION_LEN).map(|_| generator.random_range(-1.3..1.3)).collect(),
+        reward: (0..steps).map(|_| generator.random_range(-2.0..9.0)).collect(),
+        terminal,
+        first,
+        robot_mask,
+        pushed: vec![false; steps],
+        number,
+    }
+}
+
+fn plan<'a>(
+    model: &'a ModelSettings,
+    world: &'a WorldSettings,
+    behaviour: Option<&'a BehaviourSettings>,
+) -> GpuPlan<'a> {
+    GpuPlan { model, batch: (ROWS, LENGTH), world, behaviour, average_decay: 0.0, stored: (0, false) }
+}
+
+const ROWS: usize = 3;
+const LENGTH: usize = 6;
+
+/// Largest difference over the largest number.
+fn difference(found: &[f32], expected: &[f32]) -> f32 {
+    assert_eq!(found.len(), expected.len());
+    let largest = expected.iter().fold(1e-6f32, |most, x| most.max(x.abs()));
+    let worst = found.iter().zip(expected).fold(0f32, |most, (a, b)| {
+        if (a - b).is_nan() { f32::INFINITY } else { most.max((a - b).abs()) }
+    });
+    worst / largest
+}
+
+fn numbers(x: &Tensor) -> Vec<f32> {
+    x.flatten_all().unwrap().to_vec1().unwrap()
+}
+
+fn close(what: &str, found: f64, expected: f64, tolerance: f64) {
+    let error = (found - expected).abs() / expected.abs().max(1e-3);
+    assert!(error <= tolerance, "{what}: {found}, expected {expected}");
+}
+
+/// Gradients on the machine by name.
+fn gradients(learner: &mut GpuLearner) -> BTreeMap<String, Vec<f32>> {
+    let learner = learner.learner_mut();
+    let names: Vec<String> = learner.weights().entries().iter().map(|entry| entry.name.clone()).collect();
+    let gradient = |(at, name)| (name, learner.get(Array::Gradients, at).unwrap());
+    names.into_iter().enumerate().map(gradient).collect()
+}
+
+fn compare(machine: Machine, preset: Preset, kind: ModelKind, masks: bool, paint_every: usize, tolerance: f32) {
+    let model = ModelSettings::preset(preset, kind);
+    let world = WorldSettings { paint_every, ..WorldSettings::default() };
+    let behaviour = BehaviourSettings {
+        horizon: Horizon { length: 4, ..Horizon::default() },
+        ..BehaviourSettings::default()
+    };
+    let parameters = lively_parameters(&model);
+    let copy = parameters.copied().unwrap();
+    let mut gpu = GpuLearner::new(machine, &plan(&model, &world, Some(&behaviour)), &copy).unwrap();
+    let mut cpu = WorldLearner::new(&parameters, &model, &world, Trained::World).unwrap();
+    let mut actor = BehaviourLearner::new(&parameters, &model, &behaviour).unwrap();
+    for number in 0..3u64 {
+        let host = batch(ROWS, LENGTH, masks, number);
+        let found = gpu.update_world(&host, numbered_noise(SEED, number)).unwrap();
+        let on_machine = gradients(&mut gpu);
+        let mut sampler = Sampler::numbered(SEED, number);
+        let tensors = host.into_tensors(&Device::Cpu).unwrap();
+        let (losses, expected) = cpu.gradients(&tensors, &mut sampler).unwrap();
+        let values = losses.values().unwrap();
+        let tight = f64::from(tolerance);
+        close("image", found.losses.image, values.image, tight);
+        close("reward", found.losses.reward, values.reward, tight);
+        close("continue", found.losses.continues, values.continues, tight);
+        close("robot kl", found.losses.robot_kl, values.robot_kl, 10.0 * tight);
+        close("total", found.losses.total, values.total, tight);
+        if masks {
+            close("mask", found.losses.robot_mask.unwrap(), values.robot_mask.unwrap(), tight);
+        }
+        close("norm", found.gradient_norm, expected.norm(), 10.0 * tight);
+        let features = losses.observed.posteriors.features().unwrap(); // [B, T, state]
+        let features = numbers(&features.transpose(0, 1).unwrap().contiguous().unwrap());
+        let error = difference(&gpu.learner_mut().features().unwrap(), &features);
+        assert!(error <= tolerance, "features: {error:e}");
+        let mut worst = (0.0, String::new());
+        for (name, gradient) in expected.iter() {
+            if name == "interaction.key.bias" {
+                continue; // truly 0: rounding alone
+            }
+            let error = difference(&on_machine[name], &numbers(gradient));
+            if error >= worst.0 {
+                worst = (error, name.to_owned());
+            }
+        }
+        eprintln!("{kind:?} masks {masks} update {number}: worst gradient {:e} {}", worst.0, worst.1);
+        assert!(worst.0 <= 20.0 * tolerance, "gradient of {}: {:e}", worst.1, worst.0);
+        cpu.apply(&expected).unwrap();
+
+        let start = losses.observed.posteriors.map(|x| x.flatten(0, 1)).unwrap().detached();
+        actor.mix_slow_critic().unwrap();
+        let imagined = actor.imagine_shares(&start, &mut sampler).unwrap();
+        let expected = actor.gradients(imagined).unwrap();
+        let (found, _) = gpu.update_behaviour().unwrap();
+        let on_machine = gradients(&mut gpu);
+        let values = expected.values;
+        close("actor loss", found.actor_loss, values.actor_loss, 30.0 * tight);
+        close("critic loss", found.critic_loss, values.critic_loss, 10.0 * tight);
+        close("entropy", found.entropy, values.entropy, 10.0 * tight);
+        close("imagined reward", found.reward, values.reward, 30.0 * tight);
+        close("return", found.lambda_return, values.lambda_return, 30.0 * tight);
+        close("value", found.value, values.value, 30.0 * tight);
+        close("scale", found.return_scale, values.return_scale, 30.0 * tight);
+        for (name, gradient) in expected.actor.iter().chain(expected.critic.iter()) {
+            let error = difference(&on_machine[name], &numbers(gradient));
+            assert!(error <= 100.0 * tolerance, "gradient of {name}: {error:e}");
+        }
+        actor.apply(&expected).unwrap();
+    }
+    gpu.write_back(Array::Values, &copy).unwrap();
+    for (name, var) in parameters.iter() {
+        let error = difference(&numbers(&copy.get(name).unwrap().as_detached_tensor()), &numbers(var.as_tensor()));
+        assert!(error <= 1e-2, "{name} after three updates: {error:e}");
+    }
+}
+
+#[test]
+fn programs_of_kernels_give_the_losses_gradients_and_weights_of_the_trainers_own_updates() {
+    for kind in [ModelKind::Rcwm, ModelKind::Vanilla] {
+        for (masks, paint_every) in [(true, 1), (false, 3)] {
+            compare(Machine::host(), Preset::Debug, kind, masks, paint_every, 1e-4);
+        }
+    }
+}
+
+#[test]
+fn a_gpu_gives_what_the_host_gives() {
+    let machine = match Machine::nvidia(0, Precision::F32) {
+        Ok(machine) => machine,
+        Err(error) => {
+            eprintln!("not run: no GPU ({error})");
+            return;
+        }
+    };
+    drop(machine);
+    for kind in [ModelKind::Rcwm, ModelKind::Vanilla] {
+        for (masks, paint_every) in [(true, 1), (false, 3)] {
+            let machine = Machine::nvidia(0, Precision::F32).unwrap();
+            compare(machine, Preset::Debug, kind, masks, paint_every, 1e-4);
+        }
+    }
+}
