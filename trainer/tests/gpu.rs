@@ -74,9 +74,10 @@ const LENGTH: usize = 6;
 fn difference(found: &[f32], expected: &[f32]) -> f32 {
     assert_eq!(found.len(), expected.len());
     let largest = expected.iter().fold(1e-6f32, |most, x| most.max(x.abs()));
-    let worst = found.iter().zip(expected).fold(0f32, |most, (a, b)| {
-        if (a - b).is_nan() { f32::INFINITY } else { most.max((a - b).abs()) }
-    });
+    let worst = found
+        .iter()
+        .zip(expected)
+        .fold(0f32, |most, (a, b)| if (a - b).is_nan() { f32::INFINITY } else { most.max((a - b).abs()) });
     worst / largest
 }
 
@@ -97,7 +98,14 @@ fn gradients(learner: &mut GpuLearner) -> BTreeMap<String, Vec<f32>> {
     names.into_iter().enumerate().map(gradient).collect()
 }
 
-fn compare(machine: Machine, preset: Preset, kind: ModelKind, masks: bool, paint_every: usize, tolerance: f32) {
+fn compare(
+    machine: Machine,
+    preset: Preset,
+    kind: ModelKind,
+    masks: bool,
+    paint_every: usize,
+    tolerance: f32,
+) {
     let model = ModelSettings::preset(preset, kind);
     let world = WorldSettings { paint_every, ..WorldSettings::default() };
     let behaviour = BehaviourSettings {
@@ -167,7 +175,8 @@ fn compare(machine: Machine, preset: Preset, kind: ModelKind, masks: bool, paint
     }
     gpu.write_back(Array::Values, &copy).unwrap();
     for (name, var) in parameters.iter() {
-        let error = difference(&numbers(&copy.get(name).unwrap().as_detached_tensor()), &numbers(var.as_tensor()));
+        let error =
+            difference(&numbers(&copy.get(name).unwrap().as_detached_tensor()), &numbers(var.as_tensor()));
         assert!(error <= 1e-2, "{name} after three updates: {error:e}");
     }
 }

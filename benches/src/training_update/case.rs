@@ -119,7 +119,7 @@ impl Bench {
         forget_memory();
         let parameters: Parameters = agent::initialise(&case.settings, 1, &Device::Cpu)?;
         Ok(Self {
-            batch: batch(case.scale)?,
+            batch: host_batch(case.scale).into_tensors(&Device::Cpu)?,
             world: WorldLearner::new(&parameters, &case.settings, &WorldSettings::default(), Trained::World)?,
             behaviour: BehaviourLearner::new(&parameters, &case.settings, &behaviour_settings(case.scale))?,
             sampler: Sampler::seeded(1),
@@ -150,16 +150,17 @@ impl Bench {
     }
 }
 
-fn behaviour_settings(scale: Scale) -> BehaviourSettings {
+/// The paper's, with this horizon.
+pub fn behaviour_settings(scale: Scale) -> BehaviourSettings {
     let mut settings = BehaviourSettings::default();
     settings.horizon.length = scale.horizon;
     settings
 }
 
 /// Numbers that repeat at no power of two; their values do not matter for the time.
-fn batch(Scale { batch, length, .. }: Scale) -> Result<Batch> {
+pub fn host_batch(Scale { batch, length, .. }: Scale) -> HostBatch {
     let steps = batch * length;
-    let host = HostBatch {
+    HostBatch {
         rows: batch,
         length,
         image: (0..steps * IMAGE_BYTES).map(|i| (i / 7 % 251) as u8).collect(),
@@ -169,8 +170,7 @@ fn batch(Scale { batch, length, .. }: Scale) -> Result<Batch> {
         first: (0..steps).map(|i| i % (length + 5) == 11).collect(),
         pushed: vec![false; steps],
         ..HostBatch::default()
-    };
-    Ok(host.into_tensors(&Device::Cpu)?)
+    }
 }
 
 /// The yardstick: a product whose right factor stays in the cache, on all threads, by the kernel that the updates use.

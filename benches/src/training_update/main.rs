@@ -2,6 +2,7 @@
 
 mod arithmetic;
 mod case;
+mod gpu;
 mod report;
 
 use std::io::IsTerminal;
@@ -12,6 +13,7 @@ use anyhow::{Context, Result};
 use case::{Bench, Case, Times};
 use clap::{Parser, ValueEnum};
 use indicatif::{ProgressBar, ProgressStyle};
+use rcwm_gpu::Precision;
 use rcwm_models::errors::one_line;
 use rcwm_models::files::write_atomic;
 use report::Report;
@@ -36,9 +38,44 @@ struct Arguments {
     /// Measured updates of each point of the growth series over batch, length and width; 0 leaves it out
     #[arg(long, value_name = "N", default_value_t = 3)]
     growth: u32,
+    /// Where updates run: cpu, or cuda (the first NVIDIA GPU)
+    #[arg(long, value_enum, default_value = "cpu")]
+    device: Place,
+    /// Precision of matrix products on a GPU
+    #[arg(long, value_delimiter = ',', value_enum, default_value = "f32")]
+    precision: Vec<Products>,
+    /// Batches on a GPU, in place of the sizes' own
+    #[arg(long, value_name = "B", value_delimiter = ',')]
+    batch: Vec<usize>,
+    /// Learners at once on a GPU
+    #[arg(long, value_name = "N", default_value_t = 1, value_parser = clap::value_parser!(u32).range(1..=16))]
+    together: u32,
     /// Writes the results as JSON
     #[arg(long, value_name = "FILE")]
     json: Option<PathBuf>,
+}
+
+#[derive(Debug, Clone, Copy, PartialEq, Eq, ValueEnum)]
+enum Place {
+    Cpu,
+    Cuda,
+}
+
+#[derive(Debug, Clone, Copy, ValueEnum)]
+enum Products {
+    F32,
+    Tf32,
+    Bf16,
+}
+
+impl From<Products> for Precision {
+    fn from(products: Products) -> Self {
+        match products {
+            Products::F32 => Self::F32,
+            Products::Tf32 => Self::Tf32,
+            Products::Bf16 => Self::Bf16,
+        }
+    }
 }
 
 #[derive(Debug, Clone, Copy, ValueEnum)]
@@ -62,6 +99,7 @@ impl Size {
 struct Results {
     sizes: Vec<Report>,
     growth: Vec<Report>,
+    gpu: Vec<gpu::GpuReport>,
 }
 
 fn main() -> ExitCode {
@@ -77,7 +115,11 @@ fn main() -> ExitCode {
 }
 
 fn run(arguments: &Arguments) -> Result<()> {
-    let mut results = Results { sizes: Vec::new(), growth: Vec::new() };
+    let mut results = Results { sizes: Vec::new(), growth: Vec::new(), gpu: Vec::new() };
+    if arguments.device == Place::Cuda {
+        on_gpu(arguments, &mut results)?;
+        return write(arguments, &results);
+    }
     for size in &arguments.sizes {
         let report = measure(&size.case(), arguments.updates)?;
         report.print();
@@ -91,8 +133,31 @@ fn run(arguments: &Arguments) -> Result<()> {
             results.growth.push(report);
         }
     }
+    write(arguments, &results)
+}
+
+fn on_gpu(arguments: &Arguments, results: &mut Results) -> Result<()> {
+    for size in &arguments.sizes {
+        let own = size.case();
+        let batches =
+            if arguments.batch.is_empty() { vec![own.scale.batch] } else { arguments.batch.clone() };
+        for batch in batches {
+            let mut case = own.clone();
+            case.scale.batch = batch;
+            for precision in &arguments.precision {
+                let together = arguments.together as usize;
+                let report = gpu::measure(&case, 0, (*precision).into(), arguments.updates, together)?;
+                report.print();
+                results.gpu.push(report);
+            }
+        }
+    }
+    Ok(())
+}
+
+fn write(arguments: &Arguments, results: &Results) -> Result<()> {
     if let Some(path) = &arguments.json {
-        let text = serde_json::to_vec_pretty(&results)?;
+        let text = serde_json::to_vec_pretty(results)?;
         write_atomic(path, &text).with_context(|| format!("{}: not written", path.display()))?;
     }
     Ok(())

@@ -25,7 +25,7 @@ typedef unsigned char u8;
 #define LANES 32
 #define SYNC() __syncthreads()
 #define SHARED(name) extern __shared__ float name[]
-#define NOT_FINITE __int_as_float(0x7fc00000)
+#define INFINITY __int_as_float(0x7f800000)
 #else
 #include <math.h>
 #define KERNEL(name) void name(Args a, long BLOCK, long BLOCKS)
@@ -35,7 +35,7 @@ typedef unsigned char u8;
 #define LANES 1
 #define SYNC()
 #define SHARED(name) static float name[1 << 17]
-#define NOT_FINITE NAN
+
 #endif
 
 #define LANE (THREAD % LANES)

@@ -52,7 +52,8 @@ impl Stepping {
     fn new(tape: &mut Tape, mlp: Mlp, x: Matrix) -> Self {
         let room = |tape: &mut Tape, x: Matrix, block: Dense| {
             let width = block.weight.value.rows;
-            let (pre, stats, y) = (tape.matrix(x.rows, width), tape.matrix(x.rows, 2), tape.matrix(x.rows, width));
+            let (pre, stats, y) =
+                (tape.matrix(x.rows, width), tape.matrix(x.rows, 2), tape.matrix(x.rows, width));
             tape.collect_linear(x, block.weight, pre);
             tape.collect_norm(pre, block.norm, stats, y, true);
             (pre, stats, y)
@@ -171,9 +172,8 @@ fn rollout(
         .enumerate()
         .map(|(at, branch)| Head::prior(tape, branch, reached(column(at, 1))))
         .collect();
-    let interaction = (branches.len() == 2).then(|| {
-        Interacting::new(tape, sources.frozen, &sizes.model, rooms[1].input, reached(column(0, 1)))
-    });
+    let interaction = (branches.len() == 2)
+        .then(|| Interacting::new(tape, sources.frozen, &sizes.model, rooms[1].input, reached(column(0, 1))));
     let entropy = tape.matrix(steps, 1);
     let actor = Stepping::new(tape, sources.actor.mlp("actor"), states.rows(0..steps));
     let mut next_noise = |tape: &mut Tape, cols: usize, normal: bool| {
@@ -231,7 +231,13 @@ fn act(
 fn two_hot_mean(tape: &mut Tape, logits: Matrix, bins: Matrix) -> Matrix {
     let value = tape.matrix(logits.rows, 1);
     let p = [logits, bins, value].map(Pointer::from);
-    tape.program.kernel(Kernel::TwoHotMean, Grid::warps(logits.rows), &p, &[logits.rows, logits.cols, 0], &[]);
+    tape.program.kernel(
+        Kernel::TwoHotMean,
+        Grid::warps(logits.rows),
+        &p,
+        &[logits.rows, logits.cols, 0],
+        &[],
+    );
     tape.on_backward(move |tape| {
         let (d, d_logits) = (tape.gradient_of(value), tape.gradient_overwritten(logits));
         let p = [logits, bins, value, d, d_logits].map(Pointer::from);

@@ -124,7 +124,10 @@ impl Source<'_> {
     /// `NAME.linear.weight` and `NAME.norm`.
     #[must_use]
     pub fn dense(&self, name: &str) -> Dense {
-        Dense { weight: self.weight(&format!("{name}.linear.weight")), norm: self.norm(&format!("{name}.norm")) }
+        Dense {
+            weight: self.weight(&format!("{name}.linear.weight")),
+            norm: self.norm(&format!("{name}.norm")),
+        }
     }
 
     /// `NAME.0`, `NAME.1`, `NAME.out`.
@@ -176,7 +179,13 @@ impl Tape {
     /// Every row of y becomes the bias, to which a product is then added; collects the bias's gradient.
     pub fn fill_bias(&mut self, bias: Weight, y: Matrix) {
         let n = [y.rows, y.cols, y.stride];
-        self.program.kernel(Kernel::FillRows, Grid::elements(y.len()), &[bias.value.into(), y.into()], &n, &[]);
+        self.program.kernel(
+            Kernel::FillRows,
+            Grid::elements(y.len()),
+            &[bias.value.into(), y.into()],
+            &n,
+            &[],
+        );
         let Some(gradient) = bias.gradient else { return };
         self.on_backward(move |tape| {
             let dy = tape.gradient_of(y);
@@ -263,7 +272,15 @@ impl Tape {
 
     /// The recurrent cell of some of the rows: h' from its layer's output `pre` [rows, 3d] and h. `gates` [rows, 3d] takes the gradients after
     /// the norm.
-    pub fn cell_step(&mut self, pre: Matrix, norm: Norm, stats: Matrix, gates: Matrix, h: Matrix, next: Matrix) {
+    pub fn cell_step(
+        &mut self,
+        pre: Matrix,
+        norm: Norm,
+        stats: Matrix,
+        gates: Matrix,
+        h: Matrix,
+        next: Matrix,
+    ) {
         let (grid, wide) = Grid::rows(pre.rows, pre.cols);
         let p = [pre, norm.gain.value, norm.shift.value, h, next, stats].map(Pointer::from);
         let n = [pre.rows, h.cols, pre.stride, h.stride, next.stride, usize::from(wide)];
@@ -272,7 +289,8 @@ impl Tape {
             let d_next = tape.gradient_of(next);
             let d_pre = tape.gradient_overwritten(pre);
             let dh = tape.gradient_sum(h);
-            let p = [pre, norm.gain.value, norm.shift.value, h, stats, d_next, gates, d_pre, dh].map(Pointer::from);
+            let p = [pre, norm.gain.value, norm.shift.value, h, stats, d_next, gates, d_pre, dh]
+                .map(Pointer::from);
             let n = [pre.rows, h.cols, pre.stride, h.stride, d_next.stride, dh.stride, usize::from(wide)];
             tape.program.kernel(Kernel::CellBackward, grid, &p, &n, &[]);
         });
@@ -295,10 +313,10 @@ impl Tape {
         self.on_backward(move |tape| {
             let dz = tape.gradient_of(z);
             let (dx, add) = tape.gradient_term(logits);
-            let n = [&[logits.rows, n, classes, logits.stride, dz.stride, dx.stride][..], &[
-                usize::from(mode),
-                usize::from(add),
-            ]];
+            let n = [
+                &[logits.rows, n, classes, logits.stride, dz.stride, dx.stride][..],
+                &[usize::from(mode), usize::from(add)],
+            ];
             let p = [logits, dz, dx].map(Pointer::from);
             tape.program.kernel(Kernel::DrawBackward, grid, &p, &n.concat(), &[unimix]);
         });
@@ -356,7 +374,8 @@ impl Tape {
         let floats = 4 * m * (m + 1) + (3 * n + 3 * r) * (m + 1) + n * (r + 1);
         let grid = Grid { blocks: z.rows, threads: 256, shared_bytes: 4 * floats };
         let norm = [parts.norm.gain.value, parts.norm.shift.value, e].map(Pointer::from);
-        let p = [&[z.into(), u.into()][..], &weights, &norm, &[mix.into(), sum.into(), stats.into()]].concat();
+        let p =
+            [&[z.into(), u.into()][..], &weights, &norm, &[mix.into(), sum.into(), stats.into()]].concat();
         let counts = [z.rows, n, r, m, z.stride, u.stride, e.stride];
         self.program.kernel(Kernel::InteractionForward, grid, &p, &counts, &[parts.norm.eps]);
         self.on_backward(move |tape| {
@@ -370,8 +389,8 @@ impl Tape {
             let store_at = store.map_or(Pointer::NULL, |store| store.at.pointer());
             let p = [&[z.into(), u.into()][..], &weights[..7], &gradients, &[store_at, bias]].concat();
             let distances = store.map_or([0; 3], |store| store.distances);
-            let n =
-                [&[z.rows, n, r, m, z.stride, u.stride, de.stride, dz.stride, du.stride][..], &distances].concat();
+            let n = [&[z.rows, n, r, m, z.stride, u.stride, de.stride, dz.stride, du.stride][..], &distances]
+                .concat();
             tape.program.kernel(Kernel::InteractionBackward, grid, &p, &n, &[]);
         });
     }
@@ -399,7 +418,9 @@ impl Tape {
                 (parts.value, at(v, rows * r), u),
             ];
             for (layer, d, x) in pairs {
-                let (Some(weight), Some(bias)) = (layer.weight.gradient, layer.bias.gradient) else { continue };
+                let (Some(weight), Some(bias)) = (layer.weight.gradient, layer.bias.gradient) else {
+                    continue;
+                };
                 tape.product((d, true), (x, false), weight, true);
                 tape.add_column_sums(d, bias);
             }
@@ -446,7 +467,10 @@ impl Tape {
         let images = x.rows / (side * side);
         let y = self.matrix(images * twice * twice, out);
         let parts = move |chunk: &std::ops::Range<usize>| {
-            (chunk.start * side * side..chunk.end * side * side, chunk.start * twice * twice..chunk.end * twice * twice)
+            (
+                chunk.start * side * side..chunk.end * side * side,
+                chunk.start * twice * twice..chunk.end * twice * twice,
+            )
         };
         for chunk in chunks(images) {
             let (small, large) = parts(&chunk);
@@ -477,7 +501,13 @@ impl Tape {
         let windows = self.matrix(images.len() * half * half, 16 * channels);
         let x = x.rows(images.start * side * side..images.end * side * side);
         let n = [images.len(), side, channels];
-        self.program.kernel(Kernel::Windows, Grid::elements(windows.len()), &[x.into(), windows.into()], &n, &[]);
+        self.program.kernel(
+            Kernel::Windows,
+            Grid::elements(windows.len()),
+            &[x.into(), windows.into()],
+            &n,
+            &[],
+        );
         windows
     }
 

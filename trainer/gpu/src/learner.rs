@@ -192,7 +192,7 @@ impl Learner {
         let weights = Weights::new(&mut machine, specs, bins, settings.sizes.model.deter)?;
         let room = Room::new(&mut machine, &settings)?;
         let mut optimisers = Vec::new();
-        let mut optimiser = |machine: &mut Machine, group, scales| {
+        let optimiser = |machine: &mut Machine, group, scales| {
             let table = machine.allocate(8 * weights.entries().len())?;
             Ok::<_, GpuError>(Optimiser { group, scales, table, clip: machine.allocate(8)? })
         };
@@ -388,7 +388,9 @@ impl Learner {
     }
 
     fn upload_rates(&mut self, which: usize, rate: impl Fn(&str) -> f64) -> Result<(), GpuError> {
-        let Some(Optimiser { scales, table, .. }) = self.optimisers.get(which).copied() else { return Ok(()) };
+        let Some(Optimiser { scales, table, .. }) = self.optimisers.get(which).copied() else {
+            return Ok(());
+        };
         let row = |(entry, steps): (&crate::weights::Entry, &u64)| {
             let number = (*steps + 1).min(1 << 30) as i32;
             let corrections = [scales.beta1, scales.beta2].map(|beta| 1.0 - beta.powi(number));
@@ -414,12 +416,15 @@ impl Learner {
         let flags: Vec<u32> = (0..rows).map(|row| u32::from(begins(row))).collect();
         let mut actions = vec![0.0; rows * action];
         for row in (0..rows).filter(|row| !begins(*row)) {
-            for (to, x) in actions[row * action..][..action].iter_mut().zip(&batch.action[from(row) * action..]) {
+            for (to, x) in
+                actions[row * action..][..action].iter_mut().zip(&batch.action[from(row) * action..])
+            {
                 *to = x / x.abs().max(1.0);
             }
         }
         let reward: Vec<f32> = (0..rows).map(|row| batch.reward[from(row)]).collect();
-        let terminal: Vec<f32> = (0..rows).map(|row| f32::from(u8::from(batch.terminal[from(row)]))).collect();
+        let terminal: Vec<f32> =
+            (0..rows).map(|row| f32::from(u8::from(batch.terminal[from(row)]))).collect();
         let every = sizes.paint_every as u64;
         let painted: Vec<u32> = (0..rows as u32)
             .filter(|row| (u64::from(*row) / b as u64 + batch.number).is_multiple_of(every))
@@ -447,7 +452,11 @@ impl Learner {
                 }
                 (0..rows).map(|row| from(row) as u32).collect()
             }
-            _ => return Err(GpuError::Unsupported("the batch's images are not where they are expected".to_owned())),
+            _ => {
+                return Err(GpuError::Unsupported(
+                    "the batch's images are not where they are expected".to_owned(),
+                ));
+            }
         };
         let machine = &mut self.machine;
         machine.upload(inputs.index, &index)?;
@@ -465,7 +474,8 @@ impl Learner {
         self.machine.download(address(self.room.scalars), &mut scalars)?;
         let mut clip = [0f32; 2];
         self.machine.download(self.optimisers[0].clip, &mut clip)?;
-        let [image, mask, reward, continues, first, first_floored, second, second_floored] = scalars.map(f64::from);
+        let [image, mask, reward, continues, first, first_floored, second, second_floored] =
+            scalars.map(f64::from);
         let scales = self.settings.world;
         let factor = f64::from(scales.dynamics) + f64::from(scales.representation);
         let mut total = f64::from(scales.image) * image
@@ -582,9 +592,16 @@ impl Programs {
             let values = |group| weights.group(Array::Values, group);
             let (critic, slow) = (values(Group::Critic), values(Group::SlowCritic));
             let p = [critic, slow].map(Pointer::from);
-            tape.program.kernel(Kernel::Mix, Grid::elements(critic.len()), &p, &[critic.len()], &[scales.slow_share]);
+            tape.program.kernel(
+                Kernel::Mix,
+                Grid::elements(critic.len()),
+                &p,
+                &[critic.len()],
+                &[scales.slow_share],
+            );
             let source = |trains: fn(&str) -> bool| Source { weights, trains };
-            let sources = Sources { frozen: source(|_| false), actor: source(is_actor), critic: source(is_critic) };
+            let sources =
+                Sources { frozen: source(|_| false), actor: source(is_actor), critic: source(is_critic) };
             let noise = (room.inputs.noise, settings.sizes.words());
             let out = (room.range, room.behaviour_scalars);
             behaviour::losses(&mut tape, sources, &settings.sizes, &scales, room.features, noise, out);
@@ -593,14 +610,17 @@ impl Programs {
             }
             tape.program
         });
-        let programs: Vec<Program> =
-            [world(false, true), world(true, true), world(false, false)].into_iter().chain(behaviour).collect();
+        let programs: Vec<Program> = [world(false, true), world(true, true), world(false, false)]
+            .into_iter()
+            .chain(behaviour)
+            .collect();
         let layouts: Vec<_> = programs.iter().map(Program::layout).collect();
         let bytes = layouts.iter().map(|(_, bytes)| *bytes).max().unwrap_or_default();
         let arena = Arena::new(machine, bytes)?;
-        let mut ready = programs.into_iter().zip(layouts).map(|(program, (offsets, bytes))| {
-            machine.prepare(program.finish(&offsets, bytes, &arena))
-        });
+        let mut ready = programs
+            .into_iter()
+            .zip(layouts)
+            .map(|(program, (offsets, bytes))| machine.prepare(program.finish(&offsets, bytes, &arena)));
         let mut next = || ready.next().expect("there are as many as were built");
         Ok(Self { world: next(), masked: next(), judge: next(), behaviour: ready.next() })
     }
@@ -622,7 +642,8 @@ fn step(tape: &mut Tape, weights: &Weights, optimiser: Optimiser, scalars: Matri
     let grid = Grid { blocks: 1, threads: 512, shared_bytes: 0 };
     tape.program.kernel(Kernel::Clip, grid, &p, &[blocks, scalars.len()], &[scales.clip_norm]);
     let fixed = |address: u64| Pointer::from(Matrix::fixed(address, 1, 1));
-    let arrays = [Array::Values, Array::First, Array::Second, Array::Gradients].map(|a| Pointer::from(array(a)));
+    let arrays =
+        [Array::Values, Array::First, Array::Second, Array::Gradients].map(|a| Pointer::from(array(a)));
     let average = keep.map_or([Pointer::NULL; 2], |keep| [array(Array::Average).into(), fixed(keep)]);
     let p = [&arrays[..], &[clip.into(), fixed(weights.owners(group)), fixed(table)], &average].concat();
     let f = [scales.beta1 as f32, scales.beta2 as f32, scales.eps];

@@ -250,8 +250,16 @@ impl Program {
     /// Adds a matrix product.
     pub fn product(&mut self, product: Product) {
         let (m, n, k) = product.sizes();
-        let a = if product.a_transposed { (product.a.cols, product.a.rows) } else { (product.a.rows, product.a.cols) };
-        let b = if product.b_transposed { (product.b.cols, product.b.rows) } else { (product.b.rows, product.b.cols) };
+        let a = if product.a_transposed {
+            (product.a.cols, product.a.rows)
+        } else {
+            (product.a.rows, product.a.cols)
+        };
+        let b = if product.b_transposed {
+            (product.b.cols, product.b.rows)
+        } else {
+            (product.b.rows, product.b.cols)
+        };
         assert!(a == (m, k) && b == (k, n), "{a:?} x {b:?} is not {m} x {n}");
         self.push(Command::Product(product));
     }

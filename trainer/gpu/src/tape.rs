@@ -117,7 +117,13 @@ impl Tape {
 
     /// x = 0.
     pub fn zero(&mut self, x: Matrix) {
-        self.program.kernel(Kernel::Zero, Grid::elements(x.len()), &[x.into()], &[x.rows, x.cols, x.stride], &[]);
+        self.program.kernel(
+            Kernel::Zero,
+            Grid::elements(x.len()),
+            &[x.into()],
+            &[x.rows, x.cols, x.stride],
+            &[],
+        );
     }
 
     /// y = factor x, or added to y.
@@ -134,11 +140,12 @@ impl Tape {
     /// Adds the sums of columns of x [rows, width] to `out` [width].
     pub fn add_column_sums(&mut self, x: Matrix, out: Matrix) {
         // Narrow matrices are summed as wider ones: 8 rows of 4 are a row of 32.
-        let fold = if x.is_contiguous() && x.cols < 32 && 32 % x.cols == 0 && x.rows.is_multiple_of(32 / x.cols) {
-            32 / x.cols
-        } else {
-            1
-        };
+        let fold =
+            if x.is_contiguous() && x.cols < 32 && 32 % x.cols == 0 && x.rows.is_multiple_of(32 / x.cols) {
+                32 / x.cols
+            } else {
+                1
+            };
         let wide = if fold > 1 { x.reshape(x.rows / fold, 32) } else { x };
         let (chunks, rows) = chunks_of(wide.rows);
         let partial = self.matrix(chunks, wide.cols);
@@ -149,7 +156,14 @@ impl Tape {
     }
 
     /// Adds up shares: `out[j] += sum over chunks of partial[chunk * distance + offset + j]`.
-    pub fn add_partials(&mut self, partial: Pointer, out: Matrix, chunks: usize, distance: usize, offset: usize) {
+    pub fn add_partials(
+        &mut self,
+        partial: Pointer,
+        out: Matrix,
+        chunks: usize,
+        distance: usize,
+        offset: usize,
+    ) {
         let n = [chunks, out.len(), distance, offset];
         self.program.kernel(Kernel::SumPartials, Grid::elements(out.len()), &[partial, out.into()], &n, &[]);
     }

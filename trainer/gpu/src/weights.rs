@@ -60,7 +60,9 @@ impl Entry {
     fn order(&self) -> Order {
         match *self.shape.as_slice() {
             [_, b, 4, 4] => Order::Last { inner: b },
-            [_, columns] if self.name.ends_with("posterior.dense.linear.weight") => Order::Embedding { columns },
+            [_, columns] if self.name.ends_with("posterior.dense.linear.weight") => {
+                Order::Embedding { columns }
+            }
             _ => Order::Same,
         }
     }
@@ -69,9 +71,13 @@ impl Entry {
 enum Order {
     Same,
     /// [.., inner, 16] becomes [.., 16, inner].
-    Last { inner: usize },
+    Last {
+        inner: usize,
+    },
     /// The last columns of each row, in the same way; how many, the model's sizes say.
-    Embedding { columns: usize },
+    Embedding {
+        columns: usize,
+    },
 }
 
 /// One of the arrays.
@@ -107,7 +113,12 @@ impl Weights {
     ///
     /// # Errors
     /// [`GpuError::Memory`].
-    pub fn new(machine: &mut Machine, specs: &[(String, Vec<usize>)], bins: &[f32], deter: usize) -> Result<Self, GpuError> {
+    pub fn new(
+        machine: &mut Machine,
+        specs: &[(String, Vec<usize>)],
+        bins: &[f32],
+        deter: usize,
+    ) -> Result<Self, GpuError> {
         let mut specs: Vec<_> = specs.iter().map(|(name, shape)| (Group::of(name), name, shape)).collect();
         specs.sort_by_key(|(group, name, _)| (*group, (*name).clone()));
         let (mut entries, mut by_name, mut ranges) = (Vec::new(), BTreeMap::new(), BTreeMap::new());
@@ -185,7 +196,13 @@ impl Weights {
     ///
     /// # Errors
     /// [`GpuError::Failed`].
-    pub fn set(&self, machine: &mut Machine, array: Array, entry: &Entry, values: &[f32]) -> Result<(), GpuError> {
+    pub fn set(
+        &self,
+        machine: &mut Machine,
+        array: Array,
+        entry: &Entry,
+        values: &[f32],
+    ) -> Result<(), GpuError> {
         let address = self.arrays[array as usize] + 4 * entry.offset as u64;
         let mut here = vec![0.0; values.len()];
         self.pairs(entry, |there, place| here[place] = values[there]);

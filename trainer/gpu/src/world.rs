@@ -238,7 +238,12 @@ pub struct Head {
 impl Head {
     /// Room for rows of h [rows, d]; collects the weights' gradients over all of them. `pre` is there where the sum before the norm has
     /// another term already.
-    fn new(tape: &mut Tape, (weight, norm, out): (Weight, Norm, Linear), h: Matrix, pre: Option<Matrix>) -> Self {
+    fn new(
+        tape: &mut Tape,
+        (weight, norm, out): (Weight, Norm, Linear),
+        h: Matrix,
+        pre: Option<Matrix>,
+    ) -> Self {
         let (rows, hidden) = (h.rows, weight.value.rows);
         let adds = pre.is_some();
         let pre = pre.unwrap_or_else(|| tape.matrix(rows, hidden));
@@ -393,7 +398,8 @@ fn gather(tape: &mut Tape, sizes: &Sizes, from: u64, inputs: Inputs, channels: u
 
 fn encode(tape: &mut Tape, source: Source<'_>, sizes: &Sizes, images: Matrix) -> Vec<Matrix> {
     let layer = |tape: &mut Tape, x: Matrix, side: usize, name: String, reaches: bool| {
-        let (weight, norm) = (source.weight(&format!("{name}.conv.weight")), source.norm(&format!("{name}.norm")));
+        let (weight, norm) =
+            (source.weight(&format!("{name}.conv.weight")), source.norm(&format!("{name}.norm")));
         tape.conv_down(x, side, weight, norm, reaches)
     };
     let flat = |x: Matrix| x.reshape(x.rows / 16, 16 * x.cols);
@@ -440,10 +446,8 @@ fn scan(
         Some(gumbel.rows(from..from + b))
     };
     let draw = sizes.draw(None);
-    let branches: Vec<Branch> = branch_names(sizes.model.kind)
-        .iter()
-        .map(|name| Branch::new(source, name, &sizes.model))
-        .collect();
+    let branches: Vec<Branch> =
+        branch_names(sizes.model.kind).iter().map(|name| Branch::new(source, name, &sizes.model)).collect();
     let columns: Vec<_> = (0..branches.len()).map(|branch| sizes.columns(branch)).collect();
     let h_of = |branch: usize| features.columns(columns[branch].1.clone());
     let z_of = |branch: usize| features.columns(columns[branch].0.clone());
@@ -558,7 +562,8 @@ fn painted(
         .enumerate()
         .map(|(branch, prefix)| {
             let (z, h) = sizes.columns(branch);
-            let map = tape.layer(chosen.columns(z.start..h.end), source.linear(&format!("{prefix}.linear")), true);
+            let map =
+                tape.layer(chosen.columns(z.start..h.end), source.linear(&format!("{prefix}.linear")), true);
             let mut x = map.reshape(count * 16, map.cols / 16);
             for layer in 0..3 {
                 let name = format!("{prefix}.{layer}");

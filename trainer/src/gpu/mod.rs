@@ -105,8 +105,7 @@ impl GpuLearner {
             stored_images: plan.stored.0,
             stored_masks: plan.stored.1,
         };
-        let specs: Vec<_> =
-            agent::specs(model)?.into_iter().map(|spec| (spec.name, spec.shape)).collect();
+        let specs: Vec<_> = agent::specs(model)?.into_iter().map(|spec| (spec.name, spec.shape)).collect();
         let bins: Vec<f32> = ops::bins(model.bins).collect();
         let learner = Learner::new(machine, &specs, &bins, settings)?;
         let kind = model.kind;
@@ -141,7 +140,9 @@ impl GpuLearner {
     /// [`LearningError`].
     pub fn resume(&mut self, adam: &Adam) -> Result<(), LearningError> {
         for at in 0..self.learner.weights().entries().len() {
-            let Some(moments) = adam.moments().get(&self.learner.weights().entries()[at].name) else { continue };
+            let Some(moments) = adam.moments().get(&self.learner.weights().entries()[at].name) else {
+                continue;
+            };
             self.learner.set(Array::First, at, &moments.first.flatten_all()?.to_vec1::<f32>()?)?;
             self.learner.set(Array::Second, at, &moments.second.flatten_all()?.to_vec1::<f32>()?)?;
             self.learner.steps_mut()[at] = moments.steps;
@@ -219,10 +220,11 @@ impl GpuLearner {
         noise: Noise,
     ) -> Result<GpuWorldUpdate, LearningError> {
         let (rate, environment) = (self.world.adam.learning_rate, self.world.environment_learning_rate);
-        let values = self.learner.update_world(&on_gpu(batch, images, shift), noise, |name| match side_of(name) {
-            Side::Environment if environment > 0.0 => environment,
-            _ => rate,
-        })?;
+        let values =
+            self.learner.update_world(&on_gpu(batch, images, shift), noise, |name| match side_of(name) {
+                Side::Environment if environment > 0.0 => environment,
+                _ => rate,
+            })?;
         finite("the loss", values.total)?;
         finite("the norm of the gradients", values.gradient_norm)?;
         Ok(GpuWorldUpdate { losses: self.losses(values), gradient_norm: values.gradient_norm })
@@ -249,8 +251,9 @@ impl GpuLearner {
     pub fn update_behaviour(&mut self) -> Result<(BehaviourUpdate, ReturnRange), LearningError> {
         let rates = self.behaviour.as_ref().map(|b| (b.actor.learning_rate, b.critic.learning_rate));
         let (actor, critic) = rates.unwrap_or_default();
-        let values =
-            self.learner.update_behaviour(|name| if side_of(name) == Side::Actor { actor } else { critic })?;
+        let values = self
+            .learner
+            .update_behaviour(|name| if side_of(name) == Side::Actor { actor } else { critic })?;
         let BehaviourValues { actor_gradient_norm, critic_gradient_norm, range: [low, high], .. } = values;
         finite("the norm of the actor's gradients", actor_gradient_norm)?;
         finite("the norm of the critic's gradients", critic_gradient_norm)?;

@@ -14,10 +14,14 @@ pub use nvidia::Nvidia;
 #[derive(Debug, thiserror::Error)]
 pub enum GpuError {
     /// The driver, cuBLAS or NVRTC could not be loaded.
-    #[error("no NVIDIA GPU can be used: {0}; install its driver and CUDA 13 (cuBLAS and NVRTC), or leave --device out")]
+    #[error(
+        "no NVIDIA GPU can be used: {0}; install its driver and CUDA 13 (cuBLAS and NVRTC), or leave --device out"
+    )]
     Unavailable(String),
     /// This build has no GPU support.
-    #[error("this program was built without the feature `cuda`; build it with its default features, or leave --device out")]
+    #[error(
+        "this program was built without the feature `cuda`; build it with its default features, or leave --device out"
+    )]
     NotBuilt,
     /// There is not enough memory.
     #[error("the GPU has no {bytes} bytes of memory left ({reason}); take a smaller batch")]

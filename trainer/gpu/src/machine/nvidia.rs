@@ -7,8 +7,8 @@ use std::sync::Arc;
 
 use cudarc::cublas::{CudaBlas, result as blas, sys as blas_sys};
 use cudarc::driver::{
-    CudaContext, CudaEvent, CudaFunction, CudaGraph, CudaSlice, CudaStream, DevicePtr, DeviceRepr, LaunchConfig,
-    PushKernelArg, result, sys,
+    CudaContext, CudaEvent, CudaFunction, CudaGraph, CudaSlice, CudaStream, DevicePtr, DeviceRepr,
+    LaunchConfig, PushKernelArg, result, sys,
 };
 use cudarc::nvrtc::{CompileOptions, compile_ptx_with_opts};
 
@@ -32,8 +32,6 @@ const SOURCES: [&str; 8] = [
 
 /// Memory that cuBLAS works in: what NVIDIA recommends for Hopper.
 const WORKSPACE_BYTES: usize = 32 << 20;
-/// Shared memory of a block beyond which the driver must be asked.
-const SHARED_BYTES_DEFAULT: usize = 48 << 10;
 
 /// A GPU with a stream of its own.
 pub struct Nvidia {
@@ -64,7 +62,12 @@ unsafe impl Send for Graph {}
 
 /// The kernels as one source: the header once, and no includes.
 pub fn source() -> String {
-    SOURCES.concat().lines().filter(|line| !line.starts_with("#include \"common.h\"")).collect::<Vec<_>>().join("\n")
+    SOURCES
+        .concat()
+        .lines()
+        .filter(|line| !line.starts_with("#include \"common.h\""))
+        .collect::<Vec<_>>()
+        .join("\n")
 }
 
 fn failed<E: std::fmt::Debug>(what: &'static str) -> impl FnOnce(E) -> GpuError {
@@ -79,7 +82,8 @@ impl Nvidia {
         let made = catch_unwind(AssertUnwindSafe(|| Self::make(ordinal, precision)));
         std::panic::set_hook(hook);
         made.unwrap_or_else(|panic| {
-            let text = panic.downcast_ref::<String>().cloned().unwrap_or_else(|| "a library is missing".to_owned());
+            let text =
+                panic.downcast_ref::<String>().cloned().unwrap_or_else(|| "a library is missing".to_owned());
             Err(GpuError::Unavailable(text.lines().next().unwrap_or_default().to_owned()))
         })
     }
@@ -91,11 +95,13 @@ impl Nvidia {
         let stream = context.new_stream().map_err(failed("making a stream"))?;
         let (major, minor) = context.compute_capability().map_err(failed("asking for the architecture"))?;
         let options = CompileOptions {
-            options: vec![format!("--gpu-architecture=sm_{major}{minor}"), "--fmad=true".to_owned()],
+            options: vec![format!("--gpu-architecture=compute_{major}{minor}")],
             ..CompileOptions::default()
         };
-        let ptx = compile_ptx_with_opts(source(), options)
-            .map_err(|error| GpuError::Failed { what: "compiling the kernels", reason: format!("{error:?}") })?;
+        let ptx = compile_ptx_with_opts(source(), options).map_err(|error| GpuError::Failed {
+            what: "compiling the kernels",
+            reason: format!("{error:?}"),
+        })?;
         let module = context.load_module(ptx).map_err(failed("loading the kernels"))?;
         let mut kernels = HashMap::new();
         for kernel in Kernel::ALL {
@@ -150,13 +156,15 @@ impl Nvidia {
 
     pub(super) fn upload(&mut self, address: u64, bytes: &[u8]) -> Result<(), GpuError> {
         // SAFETY: the range lies in this machine's memory. Pageable memory is read before the call returns.
-        unsafe { result::memcpy_htod_async(address, bytes, self.stream.cu_stream()) }.map_err(failed("an upload"))?;
+        unsafe { result::memcpy_htod_async(address, bytes, self.stream.cu_stream()) }
+            .map_err(failed("an upload"))?;
         Ok(())
     }
 
     pub(super) fn download(&mut self, address: u64, bytes: &mut [u8]) -> Result<(), GpuError> {
         // SAFETY: the range lies in this machine's memory, and the copy has ended when the stream has.
-        unsafe { result::memcpy_dtoh_async(bytes, address, self.stream.cu_stream()) }.map_err(failed("a download"))?;
+        unsafe { result::memcpy_dtoh_async(bytes, address, self.stream.cu_stream()) }
+            .map_err(failed("a download"))?;
         self.stream.synchronize().map_err(failed("running a program"))
     }
 
@@ -215,10 +223,8 @@ impl Nvidia {
                 let mut launch = self.stream.launch_builder(&self.kernels[kernel]);
                 launch.arg(&args);
                 // SAFETY: the arguments are those that the kernel's description names, and its buffers are as large as its counts say.
-                unsafe { launch.launch(config) }.map_err(|error| GpuError::Failed {
-                    what: kernel.name(),
-                    reason: format!("{error}"),
-                })?;
+                unsafe { launch.launch(config) }
+                    .map_err(|error| GpuError::Failed { what: kernel.name(), reason: format!("{error}") })?;
                 Ok(())
             }
             Command::Product(product) => self.multiply(product),
