@@ -37,6 +37,19 @@ pub struct GpuReport {
     pub behaviour_commands: usize,
     pub memory_mbyte: f64,
     pub parts: Vec<GpuPart>,
+    /// The dearest kinds of commands, where they were asked for.
+    pub dearest: Vec<GpuCommand>,
+}
+
+/// A kind of command: all of them in an update together, and one.
+#[derive(Debug, Serialize)]
+pub struct GpuCommand {
+    pub program: &'static str,
+    pub part: &'static str,
+    pub name: String,
+    pub count: usize,
+    pub us: f64,
+    pub all_ms: f64,
 }
 
 /// A part's time, run command by command.
@@ -55,8 +68,8 @@ pub fn measure(
     case: &Case,
     ordinal: usize,
     precision: Precision,
-    updates: u32,
-    together: usize,
+    (updates, together): (u32, usize),
+    commands_shown: usize,
 ) -> Result<GpuReport> {
     let barrier = Barrier::new(together);
     let found: Vec<Result<One>> = std::thread::scope(|scope| {
@@ -64,7 +77,7 @@ pub fn measure(
             .map(|seed| {
                 scope.spawn({
                     let barrier = &barrier;
-                    move || one(case, ordinal, precision, updates, seed as u64, barrier)
+                    move || one(case, ordinal, precision, updates, (seed as u64, commands_shown), barrier)
                 })
             })
             .collect();
@@ -74,8 +87,8 @@ pub fn measure(
             .collect()
     });
     let found = found.into_iter().collect::<Result<Vec<_>>>()?;
-    let first = found.first().context("there is at least one learner")?;
     let rate: f64 = found.iter().map(|one| f64::from(updates) / one.world_alone.as_secs_f64()).sum();
+    let first = found.into_iter().next().context("there is at least one learner")?;
     let parts = first
         .parts
         .iter()
@@ -112,6 +125,7 @@ pub fn measure(
         behaviour_commands: first.commands.1,
         memory_mbyte: first.memory_bytes as f64 / 1e6,
         parts,
+        dearest: first.dearest,
     })
 }
 
@@ -124,6 +138,7 @@ struct One {
     commands: (usize, usize),
     memory_bytes: usize,
     parts: Vec<(&'static str, rcwm_gpu::machine::PartTime)>,
+    dearest: Vec<GpuCommand>,
 }
 
 fn one(
@@ -131,7 +146,7 @@ fn one(
     ordinal: usize,
     precision: Precision,
     updates: u32,
-    seed: u64,
+    (seed, commands_shown): (u64, usize),
     barrier: &Barrier,
 ) -> Result<One> {
     let start = Instant::now();
@@ -174,6 +189,24 @@ fn one(
             parts.extend(of_behaviour.into_iter().map(|part| ("behaviour", part)));
         }
     }
+    let mut dearest = Vec::new();
+    if seed == 0 && commands_shown > 0 {
+        let (of_world, of_behaviour) = learner.learner_mut().time_commands()?;
+        for (program, times) in [("world", of_world), ("behaviour", of_behaviour)] {
+            let row = |time: rcwm_gpu::machine::CommandTime| {
+                let all_ms = time.us * time.count as f64 / 1e3;
+                GpuCommand {
+                    program,
+                    part: time.part,
+                    name: time.name,
+                    count: time.count,
+                    us: time.us,
+                    all_ms,
+                }
+            };
+            dearest.extend(times.into_iter().take(commands_shown).map(row));
+        }
+    }
     let inner = learner.learner_mut();
     let (card, commands, memory_bytes) =
         (inner.machine().name(), inner.commands(), inner.machine().allocated());
@@ -186,6 +219,7 @@ fn one(
         commands,
         memory_bytes,
         parts,
+        dearest,
     })
 }
 
@@ -243,6 +277,12 @@ impl GpuReport {
             println!(
                 "  {:10} {:10} {:>9} {:>9.2} {:>10.2} {:>9.2}",
                 part.program, part.part, part.commands, part.ms, part.gflop, part.tflops_per_s
+            );
+        }
+        for row in &self.dearest {
+            println!(
+                "  {:10} {:10} {:40} {:>6} x {:>9.2} us = {:>7.2} ms",
+                row.program, row.part, row.name, row.count, row.us, row.all_ms
             );
         }
         println!();

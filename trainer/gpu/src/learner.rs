@@ -2,7 +2,7 @@
 
 use crate::behaviour::{self, BehaviourScales, Sources};
 use crate::layers::Source;
-use crate::machine::{GpuError, Kernel, Machine, PartTime, Ready};
+use crate::machine::{CommandTime, GpuError, Kernel, Machine, PartTime, Ready};
 use crate::program::{Arena, Grid, Matrix, Pointer, Program};
 use crate::tape::Tape;
 use crate::weights::{Array, Group, Weights};
@@ -361,6 +361,16 @@ impl Learner {
     pub fn time_parts(&mut self) -> Result<(Vec<PartTime>, Vec<PartTime>), GpuError> {
         let world = self.machine.time_parts(&self.programs.world)?;
         let behaviour = self.programs.behaviour.as_ref().map(|program| self.machine.time_parts(program));
+        Ok((world, behaviour.transpose()?.unwrap_or_default()))
+    }
+
+    /// How long each kind of command takes by itself: world model, then behaviour. The weights are worth nothing afterwards.
+    ///
+    /// # Errors
+    /// [`GpuError::Failed`].
+    pub fn time_commands(&mut self) -> Result<(Vec<CommandTime>, Vec<CommandTime>), GpuError> {
+        let world = self.machine.time_commands(&self.programs.world)?;
+        let behaviour = self.programs.behaviour.as_ref().map(|program| self.machine.time_commands(program));
         Ok((world, behaviour.transpose()?.unwrap_or_default()))
     }
 

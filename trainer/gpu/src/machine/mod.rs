@@ -87,6 +87,19 @@ pub struct PartTime {
     pub flops: f64,
 }
 
+/// How long one kind of command takes.
+#[derive(Debug, Clone, PartialEq)]
+pub struct CommandTime {
+    /// The part it belongs to.
+    pub part: &'static str,
+    /// The kernel with its grid, or the product with its sizes.
+    pub name: String,
+    /// How often it is in the program.
+    pub count: usize,
+    /// Time of one, repeated back to back.
+    pub us: f64,
+}
+
 impl Machine {
     /// The host.
     #[must_use]
@@ -200,6 +213,20 @@ impl Machine {
             Self::Host(host) => Ok(host.time_parts(&program.finished)),
             #[cfg(feature = "cuda")]
             Self::Nvidia(gpu) => gpu.time_parts(&program.finished),
+        }
+    }
+}
+
+impl Machine {
+    /// How long each kind of command of a program takes by itself, the dearest first; nothing on the host.
+    ///
+    /// # Errors
+    /// [`GpuError::Failed`].
+    pub fn time_commands(&mut self, program: &Ready) -> Result<Vec<CommandTime>, GpuError> {
+        match self {
+            Self::Host(_) => Ok(Vec::new()),
+            #[cfg(feature = "cuda")]
+            Self::Nvidia(gpu) => gpu.time_commands(&program.finished),
         }
     }
 }

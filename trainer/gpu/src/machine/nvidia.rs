@@ -13,7 +13,7 @@ use cudarc::driver::{
 use cudarc::nvrtc::{CompileOptions, compile_ptx_with_opts};
 
 use super::host::flops;
-use super::{Args, GpuError, Kernel, PartTime, Precision, begin};
+use super::{Args, CommandTime, GpuError, Kernel, PartTime, Precision, begin};
 use crate::program::{Command, Finished, Product};
 
 // SAFETY: plain numbers in C's layout, the same on host and device.
@@ -211,6 +211,40 @@ impl Nvidia {
         Ok(times)
     }
 
+    /// Each distinct command of a program by itself: how often it is there, and how long it takes when it is repeated.
+    pub(super) fn time_commands(&mut self, program: &Finished) -> Result<Vec<CommandTime>, GpuError> {
+        const REPEATS: u32 = 20;
+        let mut kinds: Vec<(String, &Command, usize, &'static str)> = Vec::new();
+        let mut places: HashMap<String, usize> = HashMap::new();
+        for (part, command) in &program.commands {
+            let name = describe(command);
+            let part = program.parts[usize::from(*part)];
+            let key = format!("{part} {name}");
+            match places.get(&key) {
+                Some(at) => kinds[*at].2 += 1,
+                None => {
+                    places.insert(key, kinds.len());
+                    kinds.push((name, command, 1, part));
+                }
+            }
+        }
+        let mut times = Vec::with_capacity(kinds.len());
+        for (name, command, count, part) in kinds {
+            self.execute(command)?;
+            let flags = Some(sys::CUevent_flags::CU_EVENT_DEFAULT);
+            let begin = self.stream.record_event(flags).map_err(failed("recording an event"))?;
+            for _ in 0..REPEATS {
+                self.execute(command)?;
+            }
+            let end = self.stream.record_event(flags).map_err(failed("recording an event"))?;
+            end.synchronize().map_err(failed("running a command"))?;
+            let us = 1e3 * f64::from(begin.elapsed_ms(&end).map_err(failed("timing"))?) / f64::from(REPEATS);
+            times.push(CommandTime { part, name, count, us });
+        }
+        times.sort_by(|a, b| (b.us * b.count as f64).total_cmp(&(a.us * a.count as f64)));
+        Ok(times)
+    }
+
     fn execute(&self, command: &Command) -> Result<(), GpuError> {
         match command {
             Command::Kernel { kernel, grid, p, n, f } => {
@@ -268,5 +302,18 @@ impl Nvidia {
             )
         }
         .map_err(failed("a matrix product"))
+    }
+}
+
+/// A command by what its time depends on.
+fn describe(command: &Command) -> String {
+    match command {
+        Command::Kernel { kernel, grid, .. } => format!("{} {}x{}", kernel.name(), grid.blocks, grid.threads),
+        Command::Product(product) => {
+            let (m, n, k) = product.sizes();
+            let letter = |transposed: bool| if transposed { 't' } else { 'n' };
+            let (a, b) = (letter(product.a_transposed), letter(product.b_transposed));
+            format!("product {m}x{n}x{k} {a}{b}")
+        }
     }
 }
