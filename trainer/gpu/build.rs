@@ -1,7 +1,7 @@
 //! Compiles the kernels for the host, where tests run them without a GPU.
 
 fn main() {
-    let names = ["adam", "categorical", "conv", "heads", "interaction", "norm", "rows"];
+    let names = ["adam", "categorical", "conv", "heads", "interaction", "narrow", "norm", "product", "rows"];
     let mut build = cc::Build::new();
     build.std("gnu11").opt_level(3).flag("-ffp-contract=off").flag("-Wno-unused").cargo_metadata(true);
     for name in names {

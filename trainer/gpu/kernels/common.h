@@ -38,6 +38,14 @@ typedef unsigned char u8;
 
 #endif
 
+#ifdef __CUDACC__
+typedef float4 Four;
+#else
+typedef struct {
+    float x, y, z, w;
+} Four;
+#endif
+
 #define LANE (THREAD % LANES)
 #define WARP (THREAD / LANES)
 #define WARPS (THREADS / LANES)

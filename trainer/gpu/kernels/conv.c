@@ -3,31 +3,53 @@
 // Convolutions of kernel 4, stride 2, padding 1 on maps [images, side, side, channels], as one matrix product with their windows.
 
 // Windows [images (side/2)^2, 16 channels], (row, column, channel) of the kernel in this order. p: x, windows. n: images, side, channels.
-// Counts must stay below 2^32: long batches are done in parts.
+// Counts must stay below 2^32: long batches are done in parts. Channels are read by four where they come by four.
 KERNEL(windows) {
+    u32 channels = (u32)a.n[2];
+    if (channels % 4 == 0) {
+        const Four *x = (const Four *)a.p[0];
+        Four *y = (Four *)a.p[1];
+        u32 side = (u32)a.n[1], half = side / 2, fours = channels / 4, width = 16 * fours;
+        u32 at_once = THREADS > (int)width ? (u32)THREADS / width : 1;
+        for (long group = BLOCK; group * at_once < a.n[0] * half * half; group += BLOCKS) {
+            u32 place = (u32)group * at_once + (u32)THREAD / width, top, left;
+            if (place >= a.n[0] * half * half || (u32)THREAD / width >= at_once) continue;
+            top = 2 * (place / half % half);
+            left = 2 * (place % half);
+            long image = (long)(place / (half * half)) * side;
+            for (u32 k = (u32)THREAD % width; k < width; k += (u32)THREADS) {
+                u32 tap = k / fours, row = top + tap / 4, column = left + tap % 4;
+                Four value = {0.0f, 0.0f, 0.0f, 0.0f};
+                if (row >= 1 && row <= side && column >= 1 && column <= side)
+                    value = x[((image + row - 1) * side + column - 1) * fours + k % fours];
+                y[(long)place * width + k] = value;
+            }
+        }
+        return;
+    }
     const float *x = (const float *)a.p[0];
     float *y = (float *)a.p[1];
-    u32 side = (u32)a.n[1], half = side / 2, channels = (u32)a.n[2], width = 16 * channels;
-    FOR_ALL(at, a.n[0] * half * half * width) {
-        u32 i = (u32)at, k = i % width, place = i / width, c = k % channels, tap = k / channels;
+    u32 side = (u32)a.n[1], half = side / 2;
+    FOR_ALL(at, a.n[0] * half * half * 16) {
+        u32 i = (u32)at, tap = i % 16, place = i / 16;
         u32 column = 2 * (place % half) + tap % 4, row = 2 * (place / half % half) + tap / 4;
-        float value = 0.0f;
-        if (row >= 1 && row <= side && column >= 1 && column <= side)
-            value = x[(((long)(place / (half * half)) * side + row - 1) * side + column - 1) * channels + c];
-        y[i] = value;
+        int inside = row >= 1 && row <= side && column >= 1 && column <= side;
+        const float *from = x + (((long)(place / (half * half)) * side + row - 1) * side + column - 1) * channels;
+        for (u32 c = 0; c < channels; c++) y[(long)i * channels + c] = inside ? from[c] : 0.0f;
     }
 }
 
 // The sum of windows over the places they were cut from: x [images, side, side, channels] of windows of its half-sized map.
-// p: windows, x, bias [channels] or null. n: images, side, channels, add.
+// p: windows, x, bias [channels] or null. n: images, side, channels (a multiple of 4), add.
 KERNEL(from_windows) {
-    const float *windows = (const float *)a.p[0], *bias = (const float *)a.p[2];
-    float *x = (float *)a.p[1];
-    u32 side = (u32)a.n[1], half = side / 2, channels = (u32)a.n[2], width = 16 * channels;
-    FOR_ALL(at, a.n[0] * side * side * channels) {
-        u32 i = (u32)at, c = i % channels, place = i / channels, column = place % side, row = place / side % side;
+    const Four *windows = (const Four *)a.p[0], *bias = (const Four *)a.p[2];
+    Four *x = (Four *)a.p[1];
+    u32 side = (u32)a.n[1], half = side / 2, fours = (u32)a.n[2] / 4;
+    FOR_ALL(at, a.n[0] * side * side * fours) {
+        u32 i = (u32)at, c = i % fours, place = i / fours, column = place % side, row = place / side % side;
         u32 image = place / (side * side);
-        float sum = bias ? bias[c] : 0.0f;
+        Four sum = {0.0f, 0.0f, 0.0f, 0.0f};
+        if (bias) sum = bias[c];
         // Of each four kernel rows two fall on this row: 2 p + tap - 1 = row.
         for (u32 ty = (row + 1) % 2; ty < 4; ty += 2) {
             u32 py = (row + 1 - ty) / 2;
@@ -35,10 +57,20 @@ KERNEL(from_windows) {
             for (u32 tx = (column + 1) % 2; tx < 4; tx += 2) {
                 u32 px = (column + 1 - tx) / 2;
                 if (column + 1 < tx || px >= half) continue;
-                sum += windows[((long)(image * half + py) * half + px) * width + (ty * 4 + tx) * channels + c];
+                Four term = windows[((long)((image * half + py) * half + px) * 16 + ty * 4 + tx) * fours + c];
+                sum.x += term.x;
+                sum.y += term.y;
+                sum.z += term.z;
+                sum.w += term.w;
             }
         }
-        put(x + i, a.n[3], sum);
+        if (a.n[3]) {
+            sum.x += x[i].x;
+            sum.y += x[i].y;
+            sum.z += x[i].z;
+            sum.w += x[i].w;
+        }
+        x[i] = sum;
     }
 }
 

@@ -1,212 +1,222 @@
 #include "common.h"
 
-// y [rows, m] (stride `pitch`) = x [rows, m] w^T + b, by a block; `pitch` is m + 1, which spreads rows over the banks.
-DEVICE void projected(const float *x, long pitch_x, const float *w, const float *b, float *y, long rows, long m, int THREAD_, int THREADS_) {
-    for (long i = THREAD_; i < rows * m; i += THREADS_) {
-        long r = i / m, j = i % m;
-        float sum = b[j];
-        for (long k = 0; k < m; k++) sum += x[r * pitch_x + k] * w[j * (m + 1) + k];
-        y[r * (m + 1) + j] = sum;
+// out [rows, cols] = scale * (A B) + bias, or added to out, by a block: A(i, k) = a[i ar + k ac], B(k, j) = b[k br + j bc]. Rows and depth are
+// multiples of 4; a thread does four rows of a column. Arrays that are read as A along k have a pitch that is a multiple of 4, those that are
+// read as B along k an odd one, which spreads them over the banks.
+typedef struct {
+    const float *at;
+    long row, column;
+} View;
+
+DEVICE void tile(View a, View b, const float *bias, float scale, float *out, long pitch, int add, long rows, long cols, long depth,
+                 int thread, int threads) {
+    for (long item = thread; item < rows / 4 * cols; item += threads) {
+        long j = item % cols, i = item / cols * 4;
+        const float *x = a.at + i * a.row, *y = b.at + j * b.column;
+        float s0 = 0.0f, s1 = 0.0f, s2 = 0.0f, s3 = 0.0f;
+        if (a.column == 1) {
+#pragma unroll 2
+            for (long k = 0; k < depth; k += 4) {
+                Four x0 = *(const Four *)(x + k), x1 = *(const Four *)(x + a.row + k);
+                Four x2 = *(const Four *)(x + 2 * a.row + k), x3 = *(const Four *)(x + 3 * a.row + k);
+                float y0 = y[k * b.row], y1 = y[(k + 1) * b.row], y2 = y[(k + 2) * b.row], y3 = y[(k + 3) * b.row];
+                s0 += x0.x * y0 + x0.y * y1 + x0.z * y2 + x0.w * y3;
+                s1 += x1.x * y0 + x1.y * y1 + x1.z * y2 + x1.w * y3;
+                s2 += x2.x * y0 + x2.y * y1 + x2.z * y2 + x2.w * y3;
+                s3 += x3.x * y0 + x3.y * y1 + x3.z * y2 + x3.w * y3;
+            }
+        } else {
+#pragma unroll 4
+            for (long k = 0; k < depth; k++) {
+                const float *xk = x + k * a.column;
+                float yk = y[k * b.row];
+                s0 += xk[0] * yk;
+                s1 += xk[a.row] * yk;
+                s2 += xk[2 * a.row] * yk;
+                s3 += xk[3 * a.row] * yk;
+            }
+        }
+        float shift = bias ? bias[j] : 0.0f, *to = out + i * pitch + j;
+        put(to, add, scale * s0 + shift);
+        put(to + pitch, add, scale * s1 + shift);
+        put(to + 2 * pitch, add, scale * s2 + shift);
+        put(to + 3 * pitch, add, scale * s3 + shift);
     }
 }
 
-// What forward and backward have in common: weights and inputs into shared memory, projections, attention, mixture.
+// Shared memory of forward and backward. Pitches: `even` of what is read as A along k, `odd` of what is read as B along k, `across` of maps.
 typedef struct {
+    long n, r, m, even, odd, across;
     float *wq, *wk, *wv, *wo, *z, *u, *q, *k, *v, *map, *mix, *end;
 } Work;
 
 DEVICE Work layout(float *at, long n, long r, long m) {
     Work s;
-    long w = m * (m + 1);
-    s.wq = at; s.wk = s.wq + w; s.wv = s.wk + w; s.wo = s.wv + w;
-    s.z = s.wo + w; s.u = s.z + n * (m + 1);
-    s.q = s.u + r * (m + 1); s.k = s.q + n * (m + 1); s.v = s.k + r * (m + 1);
-    s.map = s.v + r * (m + 1); s.mix = s.map + n * (r + 1); s.end = s.mix + n * (m + 1);
+    s.n = n; s.r = r; s.m = m;
+    s.even = m + 4; s.odd = m + 1; s.across = r + 4;
+    s.z = at; s.u = s.z + n * s.even; s.q = s.u + r * s.even; s.mix = s.q + n * s.even; s.map = s.mix + n * s.even;
+    s.wq = s.map + n * s.across;
+    s.wk = s.wq + m * s.odd; s.wv = s.wk + m * s.odd; s.wo = s.wv + m * s.odd;
+    s.k = s.wo + m * s.odd; s.v = s.k + r * s.odd;
+    s.end = s.v + r * s.odd;
+    s.end += (4 - (s.end - at) % 4) % 4;
     return s;
 }
 
-DEVICE void spread(const float *from, float *to, long rows, long m, int THREAD_, int THREADS_) {
-    for (long i = THREAD_; i < rows * m; i += THREADS_) to[i / m * (m + 1) + i % m] = from[i];
+DEVICE View view(const float *at, long row, long column) {
+    View v = {at, row, column};
+    return v;
 }
 
-DEVICE void attend(Work s, const float *z, const float *u, const float *wq, const float *bq, const float *wk, const float *bk,
-                   const float *wv, const float *bv, const float *wo, long n, long r, long m, int THREAD_, int THREADS_) {
-    spread(wq, s.wq, m, m, THREAD_, THREADS_);
-    spread(wk, s.wk, m, m, THREAD_, THREADS_);
-    spread(wv, s.wv, m, m, THREAD_, THREADS_);
-    spread(wo, s.wo, m, m, THREAD_, THREADS_);
-    spread(z, s.z, n, m, THREAD_, THREADS_);
-    spread(u, s.u, r, m, THREAD_, THREADS_);
+DEVICE void spread(const float *from, float *to, long pitch, long rows, long m, int thread, int threads) {
+    for (long i = thread; i < rows * m; i += threads) to[i / m * pitch + i % m] = from[i];
+}
+
+// The inputs of a row of the batch; weights once a block.
+typedef struct {
+    const float *z, *u, *wq, *bq, *wk, *bk, *wv, *bv, *wo, *bo;
+} Inputs;
+
+// Projections, attention and mixture of one row of the batch.
+DEVICE void attend(Work s, Inputs in, int thread, int threads) {
+    spread(in.z, s.z, s.even, s.n, s.m, thread, threads);
+    spread(in.u, s.u, s.even, s.r, s.m, thread, threads);
     SYNC();
-    projected(s.z, m + 1, s.wq, bq, s.q, n, m, THREAD_, THREADS_);
-    projected(s.u, m + 1, s.wk, bk, s.k, r, m, THREAD_, THREADS_);
-    projected(s.u, m + 1, s.wv, bv, s.v, r, m, THREAD_, THREADS_);
+    tile(view(s.z, s.even, 1), view(s.wq, 1, s.odd), in.bq, 1.0f, s.q, s.even, 0, s.n, s.m, s.m, thread, threads);
+    tile(view(s.u, s.even, 1), view(s.wk, 1, s.odd), in.bk, 1.0f, s.k, s.odd, 0, s.r, s.m, s.m, thread, threads);
+    tile(view(s.u, s.even, 1), view(s.wv, 1, s.odd), in.bv, 1.0f, s.v, s.odd, 0, s.r, s.m, s.m, thread, threads);
     SYNC();
-    float scale = 1.0f / sqrtf((float)m);
-    for (long i = THREAD_; i < n * r; i += THREADS_) {
-        long row = i / r, j = i % r;
-        float sum = 0.0f;
-        for (long k = 0; k < m; k++) sum += s.q[row * (m + 1) + k] * s.k[j * (m + 1) + k];
-        s.map[row * (r + 1) + j] = sum * scale;
+    tile(view(s.q, s.even, 1), view(s.k, 1, s.odd), 0, 1.0f / sqrtf((float)s.m), s.map, s.across, 0, s.n, s.r, s.m, thread, threads);
+    SYNC();
+    for (long row = thread / LANES; row < s.n; row += threads / LANES) {
+        float *x = s.map + row * s.across, largest = -INFINITY, sum = 0.0f;
+        for (long j = thread % LANES; j < s.r; j += LANES) largest = fmaxf(largest, x[j]);
+        largest = warp_max(largest);
+        for (long j = thread % LANES; j < s.r; j += LANES) sum += x[j] = expf(x[j] - largest);
+        sum = warp_sum(sum);
+        for (long j = thread % LANES; j < s.r; j += LANES) x[j] /= sum;
     }
     SYNC();
-    for (long row = THREAD_; row < n; row += THREADS_) {
-        float *x = s.map + row * (r + 1), largest = x[0], sum = 0.0f;
-        for (long j = 1; j < r; j++) largest = fmaxf(largest, x[j]);
-        for (long j = 0; j < r; j++) sum += x[j] = expf(x[j] - largest);
-        for (long j = 0; j < r; j++) x[j] /= sum;
-    }
-    SYNC();
-    for (long i = THREAD_; i < n * m; i += THREADS_) {
-        long row = i / m, j = i % m;
-        float sum = 0.0f;
-        for (long k = 0; k < r; k++) sum += s.map[row * (r + 1) + k] * s.v[k * (m + 1) + j];
-        s.mix[row * (m + 1) + j] = sum;
-    }
+    tile(view(s.map, s.across, 1), view(s.v, s.odd, 1), 0, 1.0f, s.mix, s.even, 0, s.n, s.m, s.r, thread, threads);
     SYNC();
 }
+
+DEVICE void load_weights(Work s, Inputs in, int thread, int threads) {
+    spread(in.wq, s.wq, s.odd, s.m, s.m, thread, threads);
+    spread(in.wk, s.wk, s.odd, s.m, s.m, thread, threads);
+    spread(in.wv, s.wv, s.odd, s.m, s.m, thread, threads);
+    spread(in.wo, s.wo, s.odd, s.m, s.m, thread, threads);
+}
+
+#define INPUTS(z_stride, u_stride)                                                                                             \
+    {(const float *)a.p[0] + row * (z_stride), (const float *)a.p[1] + row * (u_stride), (const float *)a.p[2], (const float *)a.p[3], \
+     (const float *)a.p[4], (const float *)a.p[5], (const float *)a.p[6], (const float *)a.p[7], (const float *)a.p[8], (const float *)a.p[9]}
 
 // The interaction (eq. 7, A.2) of one row of the batch a block: e = LayerNorm(z + W_o softmax(q k^T / sqrt(m)) v + b_o).
 // p: z [rows, n m], u [rows, (n+k) m], wq, bq, wk, bk, wv, bv, wo, bo, gain, shift, e, mix (or null), sum before the norm (or null), stats.
 // n: rows, n, n+k, m, stride of z, of u, of e. f: eps.
 KERNEL(interaction_forward) {
     SHARED(shared);
-    long n = a.n[1], r = a.n[2], m = a.n[3];
-    Work s = layout(shared, n, r, m);
-    const float *bo = (const float *)a.p[9], *gain = (const float *)a.p[10], *shift = (const float *)a.p[11];
+    Work s = layout(shared, a.n[1], a.n[2], a.n[3]);
+    const float *gain = (const float *)a.p[10], *shift = (const float *)a.p[11];
     for (long row = BLOCK; row < a.n[0]; row += BLOCKS) {
+        Inputs in = INPUTS(a.n[4], a.n[5]);
         SYNC();
-        attend(s, (const float *)a.p[0] + row * a.n[4], (const float *)a.p[1] + row * a.n[5], (const float *)a.p[2],
-               (const float *)a.p[3], (const float *)a.p[4], (const float *)a.p[5], (const float *)a.p[6],
-               (const float *)a.p[7], (const float *)a.p[8], n, r, m, THREAD, THREADS);
-        // The sum before the norm takes the place of q.
-        for (long i = THREAD; i < n * m; i += THREADS) {
-            long y = i / m, j = i % m;
-            float sum = bo[j];
-            for (long k = 0; k < m; k++) sum += s.mix[y * (m + 1) + k] * s.wo[j * (m + 1) + k];
-            s.q[y * (m + 1) + j] = s.z[y * (m + 1) + j] + sum;
-            if (a.p[13]) ((float *)a.p[13])[row * n * m + i] = s.mix[y * (m + 1) + j];
-            if (a.p[14]) ((float *)a.p[14])[row * n * m + i] = s.q[y * (m + 1) + j];
-        }
+        if (row == BLOCK) load_weights(s, in, THREAD, THREADS);
+        attend(s, in, THREAD, THREADS);
+        if (a.p[13])
+            for (long i = THREAD; i < s.n * s.m; i += THREADS)
+                ((float *)a.p[13])[row * s.n * s.m + i] = s.mix[i / s.m * s.even + i % s.m];
+        // z becomes the sum before the norm.
+        tile(view(s.mix, s.even, 1), view(s.wo, 1, s.odd), in.bo, 1.0f, s.z, s.even, 1, s.n, s.m, s.m, THREAD, THREADS);
         SYNC();
-        for (long y = THREAD; y < n; y += THREADS) {
-            const float *x = s.q + y * (m + 1);
+        for (long y = WARP; y < s.n; y += WARPS) {
+            const float *x = s.z + y * s.even;
             float mean = 0.0f, squares = 0.0f;
-            for (long j = 0; j < m; j++) mean += x[j];
-            mean /= (float)m;
-            for (long j = 0; j < m; j++) squares += (x[j] - mean) * (x[j] - mean);
-            float *stats = (float *)a.p[15] + 2 * (row * n + y);
-            stats[0] = mean;
-            stats[1] = 1.0f / sqrtf(squares / (float)m + a.f[0]);
-            s.map[y] = mean;
-            s.map[n + y] = stats[1];
-        }
-        SYNC();
-        for (long i = THREAD; i < n * m; i += THREADS) {
-            long y = i / m, j = i % m;
-            ((float *)a.p[12])[row * a.n[6] + i] = (s.q[y * (m + 1) + j] - s.map[y]) * s.map[n + y] * gain[j] + shift[j];
+            for (long j = LANE; j < s.m; j += LANES) mean += x[j];
+            mean = warp_sum(mean) / (float)s.m;
+            for (long j = LANE; j < s.m; j += LANES) squares += (x[j] - mean) * (x[j] - mean);
+            float scale = 1.0f / sqrtf(warp_sum(squares) / (float)s.m + a.f[0]);
+            for (long j = LANE; j < s.m; j += LANES) {
+                if (a.p[14]) ((float *)a.p[14])[(row * s.n + y) * s.m + j] = x[j];
+                ((float *)a.p[12])[row * a.n[6] + y * s.m + j] = (x[j] - mean) * scale * gain[j] + shift[j];
+            }
+            if (LANE == 0) {
+                float *stats = (float *)a.p[15] + 2 * (row * s.n + y);
+                stats[0] = mean;
+                stats[1] = scale;
+            }
         }
     }
 }
 
-// p: z, u, wq, bq, wk, bk, wv, bv, wo, gain, stats, de, dz (added to), du (written), store (null where the weights are frozen), bo.
+// p: z, u, wq, bq, wk, bk, wv, bv, wo, bo, gain, stats, de, dz (added to), du (written), store (null where the weights are frozen).
 // `store` [rows, 2 n m + 2 (n+k) m]: gradients of the sum before the norm and of q, then those of k and v; for the weights' gradients.
 // n: rows, n, n+k, m, stride of z, of u, of de, of dz, of du, distance of q's, of k's and of v's part in `store`.
 KERNEL(interaction_backward) {
     SHARED(shared);
-    long n = a.n[1], r = a.n[2], m = a.n[3], pitch = m + 1;
-    Work s = layout(shared, n, r, m);
-    float *d_sum = s.end, *d_mix = d_sum + n * pitch, *d_map = d_mix + n * pitch, *dq = d_map + n * (r + 1);
-    float *dk = dq + n * pitch, *dv = dk + r * pitch;
-    const float *gain = (const float *)a.p[9], *stats = (const float *)a.p[10], *bo = (const float *)a.p[15];
-    float scale = 1.0f / sqrtf((float)m);
+    Work s = layout(shared, a.n[1], a.n[2], a.n[3]);
+    long n = s.n, r = s.r, m = s.m, even = s.even;
+    float *d_sum = s.end, *d_mix = d_sum + n * even, *d_map = d_mix + n * even, *dq = d_map + n * s.across;
+    float *dk = dq + n * even, *dv = dk + r * even;
+    const float *gain = (const float *)a.p[10], *stats = (const float *)a.p[11];
     for (long row = BLOCK; row < a.n[0]; row += BLOCKS) {
+        Inputs in = INPUTS(a.n[4], a.n[5]);
         SYNC();
-        attend(s, (const float *)a.p[0] + row * a.n[4], (const float *)a.p[1] + row * a.n[5], (const float *)a.p[2],
-               (const float *)a.p[3], (const float *)a.p[4], (const float *)a.p[5], (const float *)a.p[6],
-               (const float *)a.p[7], (const float *)a.p[8], n, r, m, THREAD, THREADS);
-        const float *de = (const float *)a.p[11] + row * a.n[6];
-        float *dz = (float *)a.p[12] + row * a.n[7], *du = (float *)a.p[13] + row * a.n[8];
-        for (long i = THREAD; i < n * m; i += THREADS) {
-            long y = i / m, j = i % m;
-            float sum = bo[j];
-            for (long k = 0; k < m; k++) sum += s.mix[y * pitch + k] * s.wo[j * pitch + k];
-            float before = s.z[y * pitch + j] + sum;
-            d_mix[y * pitch + j] = (before - stats[2 * (row * n + y)]) * stats[2 * (row * n + y) + 1];  // normed, for now
-            d_sum[y * pitch + j] = de[i] * gain[j];
-        }
+        if (row == BLOCK) load_weights(s, in, THREAD, THREADS);
+        attend(s, in, THREAD, THREADS);
+        const float *de = (const float *)a.p[12] + row * a.n[6];
+        float *dz = (float *)a.p[13] + row * a.n[7], *du = (float *)a.p[14] + row * a.n[8];
+        // The sum before the norm, again.
+        tile(view(s.mix, even, 1), view(s.wo, 1, s.odd), in.bo, 1.0f, d_mix, even, 0, n, m, m, THREAD, THREADS);
         SYNC();
-        for (long y = THREAD; y < n; y += THREADS) {
-            float sum = 0.0f, product = 0.0f, *d = d_sum + y * pitch, *normed = d_mix + y * pitch;
-            for (long j = 0; j < m; j++) {
-                sum += d[j];
-                product += d[j] * normed[j];
+        for (long y = WARP; y < n; y += WARPS) {
+            float mean = stats[2 * (row * n + y)], scale = stats[2 * (row * n + y) + 1], sum = 0.0f, product = 0.0f;
+            for (long j = LANE; j < m; j += LANES) {
+                float normed = (s.z[y * even + j] + d_mix[y * even + j] - mean) * scale, d = de[y * m + j] * gain[j];
+                sum += d;
+                product += d * normed;
             }
-            for (long j = 0; j < m; j++)
-                d[j] = stats[2 * (row * n + y) + 1] * (d[j] - sum / (float)m - normed[j] * product / (float)m);
+            sum = warp_sum(sum) / (float)m;
+            product = warp_sum(product) / (float)m;
+            for (long j = LANE; j < m; j += LANES) {
+                float normed = (s.z[y * even + j] + d_mix[y * even + j] - mean) * scale, d = de[y * m + j] * gain[j];
+                d_sum[y * even + j] = scale * (d - sum - normed * product);
+            }
         }
         SYNC();
-        for (long i = THREAD; i < n * m; i += THREADS) {
-            long y = i / m, j = i % m;
-            float sum = 0.0f;
-            for (long k = 0; k < m; k++) sum += d_sum[y * pitch + k] * s.wo[k * pitch + j];
-            d_mix[y * pitch + j] = sum;
+        tile(view(d_sum, even, 1), view(s.wo, s.odd, 1), 0, 1.0f, d_mix, even, 0, n, m, m, THREAD, THREADS);
+        SYNC();
+        tile(view(d_mix, even, 1), view(s.v, 1, s.odd), 0, 1.0f, d_map, s.across, 0, n, r, m, THREAD, THREADS);
+        tile(view(s.map, 1, s.across), view(d_mix, even, 1), 0, 1.0f, dv, even, 0, r, m, n, THREAD, THREADS);
+        SYNC();
+        float factor = 1.0f / sqrtf((float)m);
+        for (long y = WARP; y < n; y += WARPS) {
+            float sum = 0.0f, *d = d_map + y * s.across, *map = s.map + y * s.across;
+            for (long j = LANE; j < r; j += LANES) sum += d[j] * map[j];
+            sum = warp_sum(sum);
+            for (long j = LANE; j < r; j += LANES) d[j] = map[j] * (d[j] - sum) * factor;
         }
         SYNC();
-        for (long i = THREAD; i < n * r; i += THREADS) {
-            long y = i / r, j = i % r;
-            float sum = 0.0f;
-            for (long k = 0; k < m; k++) sum += d_mix[y * pitch + k] * s.v[j * pitch + k];
-            d_map[y * (r + 1) + j] = sum;
-        }
-        for (long i = THREAD; i < r * m; i += THREADS) {
-            long y = i / m, j = i % m;
-            float sum = 0.0f;
-            for (long k = 0; k < n; k++) sum += s.map[k * (r + 1) + y] * d_mix[k * pitch + j];
-            dv[y * pitch + j] = sum;
-        }
+        tile(view(d_map, s.across, 1), view(s.k, s.odd, 1), 0, 1.0f, dq, even, 0, n, m, r, THREAD, THREADS);
+        tile(view(d_map, 1, s.across), view(s.q, even, 1), 0, 1.0f, dk, even, 0, r, m, n, THREAD, THREADS);
         SYNC();
-        for (long y = THREAD; y < n; y += THREADS) {
-            float sum = 0.0f, *d = d_map + y * (r + 1), *map = s.map + y * (r + 1);
-            for (long j = 0; j < r; j++) sum += d[j] * map[j];
-            for (long j = 0; j < r; j++) d[j] = map[j] * (d[j] - sum) * scale;
-        }
+        tile(view(dq, even, 1), view(s.wq, s.odd, 1), 0, 1.0f, dz, m, 1, n, m, m, THREAD, THREADS);
+        tile(view(dk, even, 1), view(s.wk, s.odd, 1), 0, 1.0f, s.u, even, 0, r, m, m, THREAD, THREADS);
         SYNC();
-        for (long i = THREAD; i < n * m; i += THREADS) {
-            long y = i / m, j = i % m;
-            float sum = 0.0f;
-            for (long k = 0; k < r; k++) sum += d_map[y * (r + 1) + k] * s.k[k * pitch + j];
-            dq[y * pitch + j] = sum;
-        }
-        for (long i = THREAD; i < r * m; i += THREADS) {
-            long y = i / m, j = i % m;
-            float sum = 0.0f;
-            for (long k = 0; k < n; k++) sum += d_map[k * (r + 1) + y] * s.q[k * pitch + j];
-            dk[y * pitch + j] = sum;
-        }
+        tile(view(dv, even, 1), view(s.wv, s.odd, 1), 0, 1.0f, s.u, even, 1, r, m, m, THREAD, THREADS);
         SYNC();
-        for (long i = THREAD; i < n * m; i += THREADS) {
-            long y = i / m, j = i % m;
-            float sum = d_sum[y * pitch + j];
-            for (long k = 0; k < m; k++) sum += dq[y * pitch + k] * s.wq[k * pitch + j];
-            dz[i] += sum;
-        }
-        for (long i = THREAD; i < r * m; i += THREADS) {
-            long y = i / m, j = i % m;
-            float sum = 0.0f;
-            for (long k = 0; k < m; k++)
-                sum += dk[y * pitch + k] * s.wk[k * pitch + j] + dv[y * pitch + k] * s.wv[k * pitch + j];
-            du[i] = sum;
-        }
-        if (a.p[14]) {
-            float *store = (float *)a.p[14];
+        for (long i = THREAD; i < n * m; i += THREADS) dz[i] += d_sum[i / m * even + i % m];
+        for (long i = THREAD; i < r * m; i += THREADS) du[i] = s.u[i / m * even + i % m];
+        if (a.p[15]) {
+            float *store = (float *)a.p[15];
             for (long i = THREAD; i < n * m; i += THREADS) {
-                store[row * n * m + i] = d_sum[i / m * pitch + i % m];
-                store[a.n[9] + row * n * m + i] = dq[i / m * pitch + i % m];
+                store[row * n * m + i] = d_sum[i / m * even + i % m];
+                store[a.n[9] + row * n * m + i] = dq[i / m * even + i % m];
             }
             for (long i = THREAD; i < r * m; i += THREADS) {
-                store[a.n[10] + row * r * m + i] = dk[i / m * pitch + i % m];
-                store[a.n[11] + row * r * m + i] = dv[i / m * pitch + i % m];
+                store[a.n[10] + row * r * m + i] = dk[i / m * even + i % m];
+                store[a.n[11] + row * r * m + i] = dv[i / m * even + i % m];
             }
         }
     }

@@ -108,10 +108,13 @@ KERNEL(column_sums) {
 KERNEL(sum_partials) {
     const float *partial = (const float *)a.p[0];
     float *out = (float *)a.p[1];
-    FOR_ALL(j, a.n[1]) {
+    for (int lane = LANE; lane < 32; lane += LANES) {
+        long j = BLOCK * 32 + lane;
         float sum = 0.0f;
-        for (long c = 0; c < a.n[0]; c++) sum += partial[c * a.n[2] + a.n[3] + j];
-        out[j] += sum;
+        if (j < a.n[1])
+            for (long c = WARP; c < a.n[0]; c += WARPS) sum += partial[c * a.n[2] + a.n[3] + j];
+        sum = across_warps(sum);
+        if (WARP == 0 && j < a.n[1]) out[j] += sum;
     }
 }
 

@@ -68,14 +68,18 @@ KERNEL(carry_backward) {
     const u32 *first = (const u32 *)a.p[0];
     float *d_initial = (float *)a.p[1], *d_carried = (float *)a.p[2];
     const float *dy = (const float *)a.p[3];
-    FOR_ALL(j, a.n[1]) {
+    for (int lane = LANE; lane < 32; lane += LANES) {
+        long j = BLOCK * 32 + lane;
         float sum = 0.0f;
-        for (long r = 0; r < a.n[0]; r++) {
-            float d = dy[r * a.n[3] + j];
-            if (!d_carried || first[r]) sum += d;
-            else d_carried[r * a.n[2] + j] += d;
+        if (j < a.n[1]) {
+            for (long r = WARP; r < a.n[0]; r += WARPS) {
+                float d = dy[r * a.n[3] + j];
+                if (!d_carried || first[r]) sum += d;
+                else d_carried[r * a.n[2] + j] += d;
+            }
         }
-        if (d_initial) d_initial[j] += sum;
+        sum = across_warps(sum);
+        if (WARP == 0 && j < a.n[1] && d_initial) d_initial[j] += sum;
     }
 }
 

@@ -10,6 +10,8 @@ use crate::weights::{Array, Weights};
 const NORM_EPS: f32 = 1e-3;
 /// LayerNorm's epsilon in the interaction model.
 const INTERACTION_NORM_EPS: f32 = 1e-5;
+/// Blocks of a norm of narrow rows: what an H100 holds at once, twice.
+const NARROW_BLOCKS: usize = 132 * 8;
 /// Images whose windows are made at a time: their number must stay below 2^32, and they take 0.5 MB an image.
 const IMAGES_AT_A_TIME: usize = 1024;
 
@@ -228,8 +230,34 @@ impl Tape {
     /// LayerNorm of rows, then `SiLU` where `silu`, all at once.
     pub fn norm(&mut self, x: Matrix, norm: Norm, y: Matrix, silu: bool) {
         let stats = stats_of(self, x.rows);
+        let fits = x.cols.is_power_of_two() && (4..=128).contains(&x.cols);
+        if silu && fits && x.is_contiguous() && y.is_contiguous() {
+            return self.narrow_norm(x, norm, stats, y);
+        }
         self.collect_norm(x, norm, stats, y, silu);
         self.norm_step(x, norm, stats, y, silu);
+    }
+
+    /// The same of narrow rows, which is what maps have.
+    fn narrow_norm(&mut self, x: Matrix, norm: Norm, stats: Matrix, y: Matrix) {
+        const THREADS: usize = 256;
+        let blocks = (x.rows * (x.cols / 4)).div_ceil(THREADS).clamp(1, NARROW_BLOCKS);
+        let grid = Grid { blocks, threads: THREADS, shared_bytes: 0 };
+        let p = [x, norm.gain.value, norm.shift.value, y, stats].map(Pointer::from);
+        self.program.kernel(Kernel::NarrowForward, grid, &p, &[x.rows, x.cols], &[norm.eps]);
+        self.on_backward(move |tape| {
+            let dy = tape.gradient_of(y);
+            let (dx, add) = tape.gradient_term(x);
+            let partial = norm.gain.gradient.map(|_| tape.matrix(blocks * 2, x.cols));
+            let p = [x, norm.gain.value, norm.shift.value, stats, dy, dx].map(Pointer::from);
+            let p = [&p[..], &[partial.into()]].concat();
+            let grid = Grid { shared_bytes: 32 * THREADS, ..grid };
+            tape.program.kernel(Kernel::NarrowBackward, grid, &p, &[x.rows, x.cols, usize::from(add)], &[]);
+            if let (Some(partial), Some(gain), Some(shift)) = (partial, norm.gain.gradient, norm.shift.gradient) {
+                tape.add_partials(partial.pointer(), gain, blocks, 2 * x.cols, 0);
+                tape.add_partials(partial.pointer(), shift, blocks, 2 * x.cols, x.cols);
+            }
+        });
     }
 
     /// The same of some of the rows, whose gain and shift are collected apart.
@@ -333,7 +361,7 @@ impl Tape {
             let d_carried = carried.map(|carried| tape.gradient_sum(carried));
             let n = [y.rows, y.cols, d_carried.map_or(0, |m| m.stride), dy.stride];
             let p = [first.into(), d_initial.into(), d_carried.into(), dy.into()];
-            let grid = Grid { blocks: y.cols.div_ceil(64), threads: 64, shared_bytes: 0 };
+            let grid = Grid { blocks: y.cols.div_ceil(32), threads: 512, shared_bytes: 0 };
             tape.program.kernel(Kernel::CarryBackward, grid, &p, &n, &[]);
         });
     }
@@ -371,8 +399,11 @@ impl Tape {
         let layers = [parts.query, parts.key, parts.value, parts.output];
         let weights: Vec<Pointer> =
             layers.iter().flat_map(|l| [l.weight.value.into(), l.bias.value.into()]).collect();
-        let floats = 4 * m * (m + 1) + (3 * n + 3 * r) * (m + 1) + n * (r + 1);
-        let grid = Grid { blocks: z.rows, threads: 256, shared_bytes: 4 * floats };
+        // As `layout` in `kernels/interaction.c` has it.
+        let (even, odd, across) = (m + 4, m + 1, r + 4);
+        let floats = (3 * n + r) * even + n * across + (4 * m + 2 * r) * odd + 4;
+        let threads = (n / 4 * m).next_multiple_of(32).clamp(64, 512);
+        let grid = Grid { blocks: z.rows, threads, shared_bytes: 4 * floats };
         let norm = [parts.norm.gain.value, parts.norm.shift.value, e].map(Pointer::from);
         let p =
             [&[z.into(), u.into()][..], &weights, &norm, &[mix.into(), sum.into(), stats.into()]].concat();
@@ -382,12 +413,11 @@ impl Tape {
             let de = tape.gradient_of(e);
             let dz = tape.gradient_sum(z);
             let du = tape.gradient_overwritten(u);
-            let floats = floats + (3 * n + 2 * r) * (m + 1) + n * (r + 1);
+            let floats = floats + (3 * n + 2 * r) * even + n * across;
             let grid = Grid { shared_bytes: 4 * floats, ..grid };
             let gradients = [parts.norm.gain.value, stats, de, dz, du].map(Pointer::from);
-            let bias = parts.output.bias.value.into();
             let store_at = store.map_or(Pointer::NULL, |store| store.at.pointer());
-            let p = [&[z.into(), u.into()][..], &weights[..7], &gradients, &[store_at, bias]].concat();
+            let p = [&[z.into(), u.into()][..], &weights, &gradients, &[store_at]].concat();
             let distances = store.map_or([0; 3], |store| store.distances);
             let n = [&[z.rows, n, r, m, z.stride, u.stride, de.stride, dz.stride, du.stride][..], &distances]
                 .concat();
@@ -514,7 +544,7 @@ impl Tape {
     fn from_windows(&mut self, windows: Matrix, x: Matrix, side: usize, bias: Option<Weight>, add: bool) {
         let p = [windows.into(), x.into(), bias.map(|bias| bias.value).into()];
         let n = [x.rows / (side * side), side, x.cols, usize::from(add)];
-        self.program.kernel(Kernel::FromWindows, Grid::elements(x.len()), &p, &n, &[]);
+        self.program.kernel(Kernel::FromWindows, Grid::elements(x.len() / 4), &p, &n, &[]);
     }
 }
 

@@ -525,6 +525,14 @@ fn check(settings: &LearnerSettings) -> Result<(), GpuError> {
             model.categoricals, model.classes
         ));
     }
+    let rows = [model.categoricals, model.classes, model.interaction_rows()];
+    if settings.sizes.branches() == 2 && rows.iter().any(|rows| !rows.is_multiple_of(4)) {
+        return refuse(format!(
+            "{} categoricals of {} classes and a width of {}; on a GPU the interaction takes multiples of 4 rows (categoricals, \
+             classes, width / classes)",
+            model.categoricals, model.classes, model.deter
+        ));
+    }
     if settings.behaviour.is_some_and(|(scales, ..)| scales.length < 2) {
         return refuse("behaviour.horizon.length must be at least 2".to_owned());
     }

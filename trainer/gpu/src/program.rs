@@ -118,6 +118,8 @@ pub struct Grid {
     pub shared_bytes: usize,
 }
 
+/// Rows up to which products are done by kernels of our own.
+const FEW_ROWS: usize = 32;
 /// Blocks beyond which a kernel's threads take turns.
 const BLOCKS_MAX: usize = 132 * 16;
 
@@ -183,6 +185,31 @@ pub struct Product {
 }
 
 impl Product {
+    /// The kernel that does this product better than a general one, where there is one: few rows, and addresses that can be read by four.
+    fn with_few_rows(&self) -> Option<(Kernel, Grid)> {
+        let (m, n, k) = self.sizes();
+        let fours = |x: Matrix| x.stride.is_multiple_of(4) && x.offset.is_multiple_of(4);
+        if m > FEW_ROWS || self.a_transposed || !k.is_multiple_of(4) || !fours(self.a) {
+            return None;
+        }
+        let groups = m.div_ceil(16);
+        if self.b_transposed {
+            let grid = Grid {
+                blocks: groups * n.div_ceil(4),
+                threads: (k / 4).next_multiple_of(32).min(256),
+                shared_bytes: 0,
+            };
+            return fours(self.b).then_some((Kernel::ProductFewRows, grid));
+        }
+        let warps = (k / 16).clamp(1, 16);
+        let grid = Grid {
+            blocks: groups * n.div_ceil(32),
+            threads: 32 * warps,
+            shared_bytes: 4 * warps * 16 * 32,
+        };
+        Some((Kernel::ProductFewRowsBack, grid))
+    }
+
     /// m, n, k.
     #[must_use]
     pub fn sizes(&self) -> (usize, usize, usize) {
@@ -261,7 +288,14 @@ impl Program {
             (product.b.rows, product.b.cols)
         };
         assert!(a == (m, k) && b == (k, n), "{a:?} x {b:?} is not {m} x {n}");
-        self.push(Command::Product(product));
+        match product.with_few_rows() {
+            Some((kernel, grid)) => {
+                let Product { a, b, c, add, .. } = product;
+                let n = [m, n, k, a.stride, b.stride, c.stride, usize::from(add)];
+                self.kernel(kernel, grid, &[a.into(), b.into(), c.into()], &n, &[]);
+            }
+            None => self.push(Command::Product(product)),
+        }
     }
 
     fn push(&mut self, command: Command) {

@@ -1,6 +1,7 @@
 //! Gradients on programs: an op adds its commands and says what to add when gradients come back.
 
 use std::collections::HashMap;
+use std::ops::Range;
 
 use crate::machine::Kernel;
 use crate::program::{Grid, Matrix, Place, Pointer, Product, Program};
@@ -18,10 +19,47 @@ pub struct Tape {
     detached: bool,
 }
 
-#[derive(Clone, Copy)]
+/// A gradient's buffer, and which of its numbers have been written: disjoint ranges in order.
 struct Gradient {
     place: Place,
-    written: bool,
+    written: Vec<Range<usize>>,
+}
+
+impl Gradient {
+    /// What of `range` has been written: all, nothing, or a part.
+    fn covers(&self, range: &Range<usize>) -> Covered {
+        let meets = |written: &&Range<usize>| written.start < range.end && range.start < written.end;
+        let mut met = self.written.iter().filter(meets);
+        match (met.next(), met.next()) {
+            (None, _) => Covered::Nothing,
+            (Some(written), None) if written.start <= range.start && range.end <= written.end => Covered::All,
+            _ => Covered::Part,
+        }
+    }
+
+    /// Takes note of a range that touches nothing written.
+    fn add(&mut self, range: Range<usize>) {
+        let at = self.written.partition_point(|written| written.end <= range.start);
+        self.written.insert(at, range);
+        for next in (1..self.written.len()).rev() {
+            if self.written[next - 1].end == self.written[next].start {
+                self.written[next - 1].end = self.written[next].end;
+                self.written.remove(next);
+            }
+        }
+    }
+}
+
+#[derive(PartialEq, Eq)]
+enum Covered {
+    All,
+    Nothing,
+    Part,
+}
+
+/// The numbers from the first to the last of a matrix.
+fn span(x: Matrix) -> Range<usize> {
+    x.offset..x.offset + (x.rows - 1) * x.stride + x.cols
 }
 
 impl Tape {
@@ -55,53 +93,40 @@ impl Tape {
         }
     }
 
-    fn gradient(&mut self, place: Place) -> Gradient {
-        if let Some(gradient) = self.gradients.get(&place) {
-            return *gradient;
-        }
-        let numbers = self.sizes.get(&place).copied().expect("only matrices of the tape have gradients");
-        let gradient = Gradient { place: self.program.buffer(numbers), written: false };
-        self.gradients.insert(place, gradient);
-        gradient
-    }
-
-    fn written(&mut self, place: Place) {
-        if let Some(gradient) = self.gradients.get_mut(&place) {
-            gradient.written = true;
-        }
+    fn gradient(&mut self, place: Place) -> &mut Gradient {
+        let Self { program, sizes, gradients, .. } = self;
+        gradients.entry(place).or_insert_with(|| {
+            let numbers = sizes.get(&place).copied().expect("only matrices of the tape have gradients");
+            Gradient { place: program.buffer(numbers), written: Vec::new() }
+        })
     }
 
     /// Where a term of x's gradient goes, and whether it is to be added to what is there.
     pub fn gradient_term(&mut self, x: Matrix) -> (Matrix, bool) {
         let gradient = self.gradient(x.place);
-        let whole = x.is_contiguous() && Some(&x.len()) == self.sizes.get(&x.place);
-        if !gradient.written && !whole {
-            self.zero_gradient(x.place);
+        let place = gradient.place;
+        if x.is_contiguous() && gradient.covers(&span(x)) == Covered::Nothing {
+            gradient.add(span(x));
+            return (Matrix { place, ..x }, false);
         }
-        self.written(x.place);
-        (Matrix { place: gradient.place, ..x }, gradient.written || !whole)
-    }
-
-    /// Where x's gradient is written by a kernel that never adds: all of the buffer must be written so before it is read.
-    pub fn gradient_overwritten(&mut self, x: Matrix) -> Matrix {
-        let gradient = self.gradient(x.place);
-        self.written(x.place);
-        Matrix { place: gradient.place, ..x }
-    }
-
-    /// Gradients may reach this matrix at a fixed address.
-    pub fn track(&mut self, x: Matrix) {
-        self.sizes.insert(x.place, x.len());
+        (self.gradient_sum(x), true)
     }
 
     /// Where a term of x's gradient is added, by a kernel that always adds.
     pub fn gradient_sum(&mut self, x: Matrix) -> Matrix {
+        let numbers = self.sizes.get(&x.place).copied().unwrap_or_default();
         let gradient = self.gradient(x.place);
-        if !gradient.written {
-            self.zero_gradient(x.place);
-            self.written(x.place);
+        let place = gradient.place;
+        if gradient.covers(&span(x)) != Covered::All {
+            // What nobody has written yet is zero, all of it: later terms are added.
+            let written = std::mem::replace(&mut gradient.written, std::iter::once(0..numbers).collect());
+            let ends = written.iter().map(|range| range.start).chain([numbers]);
+            let begins = [0].into_iter().chain(written.iter().map(|range| range.end));
+            for (from, to) in begins.zip(ends).filter(|(from, to)| from < to) {
+                self.zero(Matrix { place, offset: from, rows: 1, cols: to - from, stride: to - from });
+            }
         }
-        Matrix { place: gradient.place, ..x }
+        Matrix { place, ..x }
     }
 
     /// The gradient of x, all of whose terms have been added.
@@ -109,10 +134,19 @@ impl Tape {
         self.gradient_sum(x)
     }
 
-    fn zero_gradient(&mut self, place: Place) {
-        let (numbers, gradient) = (self.sizes[&place], self.gradient(place));
-        let all = Matrix { place: gradient.place, offset: 0, rows: 1, cols: numbers, stride: numbers };
-        self.zero(all);
+    /// Where x's gradient is written by a kernel that never adds, and that writes all columns.
+    pub fn gradient_overwritten(&mut self, x: Matrix) -> Matrix {
+        let gradient = self.gradient(x.place);
+        assert!(gradient.covers(&span(x)) != Covered::Part, "a gradient is written where a part of it was");
+        if gradient.covers(&span(x)) == Covered::Nothing {
+            gradient.add(span(x));
+        }
+        Matrix { place: gradient.place, ..x }
+    }
+
+    /// Gradients may reach this matrix at a fixed address.
+    pub fn track(&mut self, x: Matrix) {
+        self.sizes.insert(x.place, x.len());
     }
 
     /// x = 0.
@@ -165,7 +199,8 @@ impl Tape {
         offset: usize,
     ) {
         let n = [chunks, out.len(), distance, offset];
-        self.program.kernel(Kernel::SumPartials, Grid::elements(out.len()), &[partial, out.into()], &n, &[]);
+        let grid = Grid { blocks: out.len().div_ceil(32), threads: 256, shared_bytes: 0 };
+        self.program.kernel(Kernel::SumPartials, grid, &[partial, out.into()], &n, &[]);
     }
 }
 

@@ -284,6 +284,8 @@ kernels! {
     TwoHotLoss two_hot_loss, TwoHotMean two_hot_mean, ContinueLoss continue_loss, ScaledSigmoid scaled_sigmoid,
     ActorDraw actor_draw, ActorBackward actor_backward, LambdaReturns lambda_returns, ActorLoss actor_loss,
     ReturnRange return_range, Squares squares, Clip clip, Adam adam, Mix mix,
+    NarrowForward narrow_forward, NarrowBackward narrow_backward,
+    ProductFewRows product_few_rows, ProductFewRowsBack product_few_rows_back,
 }
 
 /// Arguments as kernels take them; the same in `kernels/common.h`.

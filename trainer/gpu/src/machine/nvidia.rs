@@ -19,14 +19,16 @@ use crate::program::{Command, Finished, Product};
 // SAFETY: plain numbers in C's layout, the same on host and device.
 unsafe impl DeviceRepr for Args {}
 
-const SOURCES: [&str; 8] = [
+const SOURCES: [&str; 10] = [
     include_str!("../../kernels/common.h"),
     include_str!("../../kernels/adam.c"),
     include_str!("../../kernels/categorical.c"),
     include_str!("../../kernels/conv.c"),
     include_str!("../../kernels/heads.c"),
     include_str!("../../kernels/interaction.c"),
+    include_str!("../../kernels/narrow.c"),
     include_str!("../../kernels/norm.c"),
+    include_str!("../../kernels/product.c"),
     include_str!("../../kernels/rows.c"),
 ];
 
