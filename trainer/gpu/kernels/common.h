@@ -24,6 +24,7 @@ typedef unsigned char u8;
 #define THREADS ((int)blockDim.x)
 #define LANES 32
 #define SYNC() __syncthreads()
+#define UNROLL _Pragma("unroll")
 #define SHARED(name) extern __shared__ float name[]
 #define INFINITY __int_as_float(0x7f800000)
 #else
@@ -34,6 +35,7 @@ typedef unsigned char u8;
 #define THREADS 1
 #define LANES 1
 #define SYNC()
+#define UNROLL
 #define SHARED(name) static float name[1 << 17]
 
 #endif

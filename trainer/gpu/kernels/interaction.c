@@ -15,7 +15,6 @@ DEVICE void tile(View a, View b, const float *bias, float scale, float *out, lon
         const float *x = a.at + i * a.row, *y = b.at + j * b.column;
         float s0 = 0.0f, s1 = 0.0f, s2 = 0.0f, s3 = 0.0f;
         if (a.column == 1) {
-#pragma unroll 2
             for (long k = 0; k < depth; k += 4) {
                 Four x0 = *(const Four *)(x + k), x1 = *(const Four *)(x + a.row + k);
                 Four x2 = *(const Four *)(x + 2 * a.row + k), x3 = *(const Four *)(x + 3 * a.row + k);
@@ -26,7 +25,6 @@ DEVICE void tile(View a, View b, const float *bias, float scale, float *out, lon
                 s3 += x3.x * y0 + x3.y * y1 + x3.z * y2 + x3.w * y3;
             }
         } else {
-#pragma unroll 4
             for (long k = 0; k < depth; k++) {
                 const float *xk = x + k * a.column;
                 float yk = y[k * b.row];

@@ -14,15 +14,15 @@
     }
 
 DEVICE void scatter_sums(float *sums) {
-#pragma unroll
+UNROLL
     HALVE(16, 32)
-#pragma unroll
+UNROLL
     HALVE(8, 16)
-#pragma unroll
+UNROLL
     HALVE(4, 8)
-#pragma unroll
+UNROLL
     HALVE(2, 4)
-#pragma unroll
+UNROLL
     HALVE(1, 2)
 }
 #endif
@@ -35,20 +35,20 @@ KERNEL(product_few_rows) {
     long m = a.n[0], n = a.n[1], k = a.n[2], columns = (n + COLUMNS_AT_ONCE - 1) / COLUMNS_AT_ONCE;
     long first = BLOCK % columns * COLUMNS_AT_ONCE, from = BLOCK / columns * ROWS_AT_ONCE;
     float sums[ROWS_AT_ONCE * COLUMNS_AT_ONCE];
-#pragma unroll
+UNROLL
     for (int i = 0; i < ROWS_AT_ONCE * COLUMNS_AT_ONCE; i++) sums[i] = 0.0f;
     for (long at = 4 * THREAD; at < k; at += 4 * THREADS) {
         Four of_w[COLUMNS_AT_ONCE];
-#pragma unroll
+UNROLL
         for (int c = 0; c < COLUMNS_AT_ONCE; c++) {
             long column = first + c < n ? first + c : n - 1;
             of_w[c] = *(const Four *)(w + column * a.n[4] + at);
         }
-#pragma unroll
+UNROLL
         for (int r = 0; r < ROWS_AT_ONCE; r++) {
             long row = from + r < m ? from + r : m - 1;
             Four of_x = *(const Four *)(x + row * a.n[3] + at);
-#pragma unroll
+UNROLL
             for (int c = 0; c < COLUMNS_AT_ONCE; c++)
                 sums[r * COLUMNS_AT_ONCE + c] +=
                     of_x.x * of_w[c].x + of_x.y * of_w[c].y + of_x.z * of_w[c].z + of_x.w * of_w[c].w;
@@ -82,13 +82,12 @@ KERNEL(product_few_rows_back) {
     for (int lane = LANE; lane < 32; lane += LANES) {
         long column = BLOCK % columns * 32 + lane, inside = column < n ? column : n - 1;
         float sums[ROWS_AT_ONCE];
-#pragma unroll
+UNROLL
         for (int r = 0; r < ROWS_AT_ONCE; r++) sums[r] = 0.0f;
-#pragma unroll 2
         for (long at = 4 * WARP; at < k; at += 4 * WARPS) {
             const float *of_w = w + at * a.n[4] + inside;
             float w0 = of_w[0], w1 = of_w[a.n[4]], w2 = of_w[2 * a.n[4]], w3 = of_w[3 * a.n[4]];
-#pragma unroll
+UNROLL
             for (int r = 0; r < ROWS_AT_ONCE; r++) {
                 long row = from + r < m ? from + r : m - 1;
                 Four of_x = *(const Four *)(x + row * a.n[3] + at);
@@ -96,7 +95,7 @@ KERNEL(product_few_rows_back) {
             }
         }
 #ifdef __CUDACC__
-#pragma unroll
+UNROLL
         for (int r = 0; r < ROWS_AT_ONCE; r++) shared[(WARP * ROWS_AT_ONCE + r) * 32 + lane] = sums[r];
         __syncthreads();
         for (int r = WARP; r < ROWS_AT_ONCE; r += WARPS) {

@@ -163,6 +163,8 @@ pub enum Command {
         /// Factors.
         f: Vec<f32>,
     },
+    /// The other lane goes on only when this one has come here.
+    HandOver,
     /// `c = a b + beta c`, row by row: a [m, k] or its transpose, b [k, n] or its transpose.
     Product(Product),
 }
@@ -217,20 +219,55 @@ impl Product {
     }
 }
 
+/// Which of two sequences of commands one belongs to: they run side by side between the points where one hands over to the other.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
+pub enum Lane {
+    /// Where every program begins and ends.
+    #[default]
+    Main,
+    /// Beside it.
+    Side,
+}
+
+impl Lane {
+    /// The other one.
+    #[must_use]
+    pub fn other(self) -> Self {
+        match self {
+            Self::Main => Self::Side,
+            Self::Side => Self::Main,
+        }
+    }
+}
+
+/// A command and where it belongs.
+#[derive(Debug, Clone, PartialEq)]
+pub struct Item {
+    /// Which of the program's parts.
+    pub part: u16,
+    /// Which lane.
+    pub lane: Lane,
+    /// What is done.
+    pub command: Command,
+}
+
 /// A list of commands under way.
 #[derive(Debug, Default)]
 pub struct Program {
-    commands: Vec<(u16, Command)>,
+    items: Vec<Item>,
     parts: Vec<&'static str>,
     sizes: Vec<usize>,
     part: u16,
+    lane: Lane,
+    /// Where both lanes are in use: what is needed anywhere in such a range is kept for all of it.
+    forked: Vec<Range<usize>>,
 }
 
 /// A program whose buffers have addresses.
 #[derive(Debug)]
 pub struct Finished {
-    /// Which part of `parts` each command belongs to, and the command with fixed places alone.
-    pub commands: Vec<(u16, Command)>,
+    /// The commands, with fixed places alone.
+    pub items: Vec<Item>,
     /// Names of parts.
     pub parts: Vec<&'static str>,
     /// Memory its buffers take together.
@@ -268,6 +305,36 @@ impl Program {
         self.parts.get(usize::from(self.part)).copied().unwrap_or_default()
     }
 
+    /// Commands from now on belong to this lane; the one before.
+    pub fn lane(&mut self, lane: Lane) -> Lane {
+        std::mem::replace(&mut self.lane, lane)
+    }
+
+    /// The lane that commands belong to now.
+    #[must_use]
+    pub fn current_lane(&self) -> Lane {
+        self.lane
+    }
+
+    /// `from` has come to where the other lane may go on.
+    pub fn hand_over(&mut self, from: Lane) {
+        let before = self.lane(from);
+        self.push(Command::HandOver);
+        self.lane(before);
+    }
+
+    /// Both lanes are in use from here on.
+    pub fn fork(&mut self) {
+        self.forked.push(self.items.len()..usize::MAX);
+    }
+
+    /// The main lane alone is in use from here on.
+    pub fn join(&mut self) {
+        if let Some(forked) = self.forked.last_mut() {
+            forked.end = self.items.len();
+        }
+    }
+
     /// Adds a kernel.
     pub fn kernel(&mut self, kernel: Kernel, grid: Grid, p: &[Pointer], n: &[usize], f: &[f32]) {
         let n = n.iter().map(|n| *n as i64).collect();
@@ -302,20 +369,28 @@ impl Program {
         if self.parts.is_empty() {
             self.parts.push("other");
         }
-        self.commands.push((self.part, command));
+        self.items.push(Item { part: self.part, lane: self.lane, command });
     }
 
     /// Gives every buffer an address: buffers whose first and last uses do not overlap share memory. `arena` grows where it is too small,
     /// so all programs of an arena must be finished before the first one is run.
     pub fn layout(&self) -> (Vec<usize>, usize) {
         let mut lives: Vec<Option<(usize, usize)>> = vec![None; self.sizes.len()];
-        for (at, (_, command)) in self.commands.iter().enumerate() {
-            each_place(command, |place| {
+        for (at, item) in self.items.iter().enumerate() {
+            each_place(&item.command, |place| {
                 if let Place::Transient(id) = place {
                     let life = lives[id as usize].get_or_insert((at, at));
                     life.1 = at;
                 }
             });
+        }
+        // Lanes run side by side: their order in the list says nothing.
+        for life in lives.iter_mut().flatten() {
+            for forked in &self.forked {
+                if life.0 < forked.end && forked.start <= life.1 {
+                    *life = (life.0.min(forked.start), life.1.max(forked.end.min(self.items.len())));
+                }
+            }
         }
         let mut order: Vec<usize> = (0..self.sizes.len()).filter(|id| lives[*id].is_some()).collect();
         // Large buffers first: small ones fill the gaps between them.
@@ -353,8 +428,9 @@ impl Program {
             Place::Transient(id) => Place::Fixed(arena.address + offsets[id as usize] as u64),
         };
         let matrix = |m: Matrix| Matrix { place: fix(m.place), ..m };
-        let commands = self.commands.into_iter().map(|(part, command)| {
-            let command = match command {
+        let items = self.items.into_iter().map(|item| {
+            let command = match item.command {
+                Command::HandOver => Command::HandOver,
                 Command::Kernel { kernel, grid, p, n, f } => {
                     let p = p.into_iter().map(|p| Pointer { place: p.place.map(fix), ..p }).collect();
                     Command::Kernel { kernel, grid, p, n, f }
@@ -363,9 +439,9 @@ impl Program {
                     Command::Product(Product { a: matrix(p.a), b: matrix(p.b), c: matrix(p.c), ..p })
                 }
             };
-            (part, command)
+            Item { command, ..item }
         });
-        Finished { commands: commands.collect(), parts: self.parts, bytes }
+        Finished { items: items.collect(), parts: self.parts, bytes }
     }
 }
 
@@ -382,6 +458,7 @@ impl Arena {
 fn each_place(command: &Command, mut look: impl FnMut(Place)) {
     match command {
         Command::Kernel { p, .. } => p.iter().filter_map(|p| p.place).for_each(look),
+        Command::HandOver => (),
         Command::Product(p) => [p.a, p.b, p.c].iter().for_each(|m| look(m.place)),
     }
 }
@@ -404,5 +481,20 @@ mod tests {
         assert_eq!(offsets[0], offsets[2], "a is dead when c is born");
         assert_ne!(offsets[0], offsets[1]);
         assert_eq!(bytes, 2 * 4096);
+    }
+
+    #[test]
+    fn buffers_of_a_fork_are_kept_until_its_end() {
+        let mut program = Program::default();
+        let [a, b, c] = [program.buffer(1000), program.buffer(1000), program.buffer(1000)];
+        let m = |place| Matrix { place, offset: 0, rows: 10, cols: 100, stride: 100 };
+        program.fork();
+        for (x, y) in [(a, b), (b, c)] {
+            program.kernel(Kernel::CopyRows, Grid::elements(1000), &[m(x).into(), m(y).into()], &[], &[]);
+        }
+        program.join();
+        let (offsets, bytes) = program.layout();
+        assert_ne!(offsets[0], offsets[2], "the other lane may still read a when c is written");
+        assert_eq!(bytes, 3 * 4096);
     }
 }

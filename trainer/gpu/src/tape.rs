@@ -4,7 +4,7 @@ use std::collections::HashMap;
 use std::ops::Range;
 
 use crate::machine::Kernel;
-use crate::program::{Grid, Matrix, Place, Pointer, Product, Program};
+use crate::program::{Grid, Lane, Matrix, Place, Pointer, Product, Program};
 
 type Backward = Box<dyn FnOnce(&mut Tape)>;
 
@@ -15,7 +15,7 @@ pub struct Tape {
     pub program: Program,
     sizes: HashMap<Place, usize>,
     gradients: HashMap<Place, Gradient>,
-    backward: Vec<(&'static str, Backward)>,
+    backward: Vec<(&'static str, Lane, Backward)>,
     detached: bool,
 }
 
@@ -73,7 +73,8 @@ impl Tape {
     /// Says what to add backward, in the part that is current now.
     pub fn on_backward(&mut self, body: impl FnOnce(&mut Self) + 'static) {
         if !self.detached {
-            self.backward.push((self.program.current_part(), Box::new(body)));
+            let (part, lane) = (self.program.current_part(), self.program.current_lane());
+            self.backward.push((part, lane, Box::new(body)));
         }
     }
 
@@ -87,10 +88,38 @@ impl Tape {
 
     /// Adds the way back, from the last op to the first.
     pub fn run_backward(&mut self) {
-        while let Some((part, body)) = self.backward.pop() {
+        while let Some((part, lane, body)) = self.backward.pop() {
             self.program.part(part);
+            self.program.lane(lane);
             body(self);
         }
+        self.program.lane(Lane::Main);
+    }
+
+    /// Ops of `body` run beside the main lane, from where that is now; so do theirs backward. The main lane may not add to the gradients
+    /// that they add to.
+    pub fn beside(&mut self, body: impl FnOnce(&mut Self)) {
+        self.hand_over(Lane::Main);
+        self.program.lane(Lane::Side);
+        body(self);
+        self.program.lane(Lane::Main);
+    }
+
+    /// The side lane goes on where the main lane is (`from` main), or the other way round; backward likewise, the other way.
+    fn hand_over(&mut self, from: Lane) {
+        self.program.hand_over(from);
+        self.on_backward(move |tape| tape.program.hand_over(from.other()));
+    }
+
+    /// Ops of `body` may use [`Tape::beside`]; both lanes are through when it ends, backward too.
+    pub fn forked(&mut self, body: impl FnOnce(&mut Self)) {
+        self.program.fork();
+        self.on_backward(|tape| tape.program.join());
+        self.hand_over(Lane::Main);
+        body(self);
+        self.hand_over(Lane::Side);
+        self.program.join();
+        self.on_backward(|tape| tape.program.fork());
     }
 
     fn gradient(&mut self, place: Place) -> &mut Gradient {

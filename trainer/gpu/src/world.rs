@@ -484,39 +484,37 @@ fn scan(
     let actions = Matrix::fixed(inputs.action, rows, sizes.model.action);
     tape.copy(actions, rooms[0].input.columns(nm..nm + sizes.model.action), false, 1.0);
 
-    for t in 0..sizes.length {
-        let here = t * b..(t + 1) * b;
-        let first = Matrix::fixed(inputs.first, rows, 1).rows(here.clone());
-        let carried = |x: Matrix| (t > 0).then(|| x.rows((t - 1) * b..t * b));
-        let at = |x: Matrix| x.rows(here.clone());
-        for branch in 0..branches.len() {
-            let (z, h) = initial[branch];
-            let into = match (&interaction, branch) {
-                (Some((_, interaction)), 1) => interaction.z(),
-                _ => rooms[0].input.columns(0..nm),
+    // What the environment's lane sees of the robot has gradients of its own: each lane adds to its own.
+    let robot_h = interaction.map(|_| tape.matrix(rows, sizes.model.deter));
+    tape.forked(|tape| {
+        for t in 0..sizes.length {
+            let here = t * b..(t + 1) * b;
+            let first = Matrix::fixed(inputs.first, rows, 1).rows(here.clone());
+            let at = |x: Matrix| x.rows(here.clone());
+            let carry = |tape: &mut Tape, branch: usize, z: Matrix| {
+                let carried = |x: Matrix| (t > 0).then(|| x.rows((t - 1) * b..t * b));
+                let (z_0, h_0) = initial[branch];
+                tape.carry(first, z_0, carried(z_of(branch)), at(z));
+                tape.carry(first, h_0, carried(h_of(branch)), at(rooms[branch].before()));
             };
-            tape.carry(first, z, carried(z_of(branch)), at(into));
-            tape.carry(first, h, carried(h_of(branch)), at(rooms[branch].before()));
+            carry(tape, 0, rooms[0].input.columns(0..nm));
+            rooms[0].step(tape, &branches[0], here.clone(), at(h_of(0)));
+            if let (Some((prior, interaction)), Some(robot_h)) = (&interaction, robot_h) {
+                let logits = prior.step(tape, at(h_of(0)), here.clone());
+                tape.draw(logits, gumbel(t, 0), at(interaction.prior_z()), draw);
+                tape.copied(at(h_of(0)), at(robot_h));
+                tape.beside(|tape| {
+                    carry(tape, 1, interaction.z());
+                    interaction.step(tape, at(robot_h), here.clone());
+                    rooms[1].step(tape, &branches[1], here.clone(), at(h_of(1)));
+                    let logits = posteriors[1].step(tape, at(h_of(1)), here.clone());
+                    tape.draw(logits, gumbel(t, 2), at(z_of(1)), draw);
+                });
+            }
+            let logits = posteriors[0].step(tape, at(h_of(0)), here.clone());
+            tape.draw(logits, gumbel(t, draws.min(2) - 1), at(z_of(0)), draw);
         }
-        rooms[0].step(tape, &branches[0], here.clone(), at(h_of(0)));
-        let mut which = 0;
-        let mut next = || {
-            which += 1;
-            gumbel(t, which - 1)
-        };
-        if let Some((prior, interaction)) = &interaction {
-            let logits = prior.step(tape, at(h_of(0)), here.clone());
-            tape.draw(logits, next(), at(interaction.prior_z()), draw);
-        }
-        let logits = posteriors[0].step(tape, at(h_of(0)), here.clone());
-        tape.draw(logits, next(), at(z_of(0)), draw);
-        if let Some((_, interaction)) = &interaction {
-            interaction.step(tape, at(h_of(0)), here.clone());
-            rooms[1].step(tape, &branches[1], here.clone(), at(h_of(1)));
-            let logits = posteriors[1].step(tape, at(h_of(1)), here.clone());
-            tape.draw(logits, next(), at(z_of(1)), draw);
-        }
-    }
+    });
     // Nothing in the scan needs the last branch's prior: its head runs once over all rows.
     let last = branches.len() - 1;
     let head = Head::prior(tape, &branches[last], h_of(last));

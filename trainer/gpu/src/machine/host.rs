@@ -55,19 +55,19 @@ impl Host {
     }
 
     pub(super) fn run(&mut self, program: &Finished) {
-        program.commands.iter().for_each(|(_, command)| execute(command));
+        program.items.iter().for_each(|item| execute(&item.command));
     }
 
     pub(super) fn time_parts(&mut self, program: &Finished) -> Vec<PartTime> {
         let mut times: Vec<PartTime> =
             program.parts.iter().map(|part| PartTime { part, commands: 0, ms: 0.0, flops: 0.0 }).collect();
-        for (part, command) in &program.commands {
+        for item in &program.items {
             let start = Instant::now();
-            execute(command);
-            let time = &mut times[usize::from(*part)];
+            execute(&item.command);
+            let time = &mut times[usize::from(item.part)];
             time.ms += 1e3 * start.elapsed().as_secs_f64();
             time.commands += 1;
-            time.flops += flops(command);
+            time.flops += flops(&item.command);
         }
         times
     }
@@ -76,7 +76,7 @@ impl Host {
 /// Operations of a matrix product; kernels count as none.
 pub(super) fn flops(command: &Command) -> f64 {
     match command {
-        Command::Kernel { .. } => 0.0,
+        Command::Kernel { .. } | Command::HandOver => 0.0,
         Command::Product(product) => {
             let (m, n, k) = product.sizes();
             2.0 * m as f64 * n as f64 * k as f64
@@ -95,6 +95,7 @@ fn execute(command: &Command) {
                 unsafe { function(args, block, grid.blocks as i64) }
             }
         }
+        Command::HandOver => (),
         Command::Product(product) => multiply(product),
     }
 }

@@ -4,7 +4,7 @@ mod host;
 #[cfg(feature = "cuda")]
 mod nvidia;
 
-use crate::program::Finished;
+use crate::program::{Command, Finished};
 
 pub use host::Host;
 #[cfg(feature = "cuda")]
@@ -235,7 +235,7 @@ impl Ready {
     /// Commands in it: kernels and matrix products.
     #[must_use]
     pub fn commands(&self) -> usize {
-        self.finished.commands.len()
+        self.finished.items.iter().filter(|item| item.command != Command::HandOver).count()
     }
 
     /// Memory of its buffers.

@@ -14,7 +14,7 @@ use cudarc::nvrtc::{CompileOptions, compile_ptx_with_opts};
 
 use super::host::flops;
 use super::{Args, CommandTime, GpuError, Kernel, PartTime, Precision, begin};
-use crate::program::{Command, Finished, Product};
+use crate::program::{Command, Finished, Lane, Product};
 
 // SAFETY: plain numbers in C's layout, the same on host and device.
 unsafe impl DeviceRepr for Args {}
@@ -38,7 +38,9 @@ const WORKSPACE_BYTES: usize = 32 << 20;
 /// A GPU with a stream of its own.
 pub struct Nvidia {
     stream: Arc<CudaStream>,
+    /// cuBLAS on the stream, and a stream beside it with its own.
     blas: CudaBlas,
+    side: (Arc<CudaStream>, CudaBlas),
     kernels: HashMap<Kernel, CudaFunction>,
     memory: Vec<CudaSlice<u8>>,
     precision: Precision,
@@ -119,23 +121,39 @@ impl Nvidia {
                 function.set_attribute(attribute, most).map_err(failed("asking for shared memory"))?;
             }
         }
-        let cublas = CudaBlas::new(stream.clone()).map_err(failed("starting cuBLAS"))?;
-        let mut machine = Self { stream, blas: cublas, kernels, memory: Vec::new(), precision };
-        let workspace = machine.allocate(WORKSPACE_BYTES)?;
+        let start = |stream: &Arc<CudaStream>| CudaBlas::new(stream.clone()).map_err(failed("starting cuBLAS"));
+        let beside = context.new_stream().map_err(failed("making a stream"))?;
+        let (blas, side) = (start(&stream)?, (beside.clone(), start(&beside)?));
+        let mut machine = Self { stream, blas, side, kernels, memory: Vec::new(), precision };
+        for lane in [Lane::Main, Lane::Side] {
+            machine.set_up_products(lane)?;
+        }
+        Ok(machine)
+    }
+
+    /// Memory and precision of cuBLAS.
+    fn set_up_products(&mut self, lane: Lane) -> Result<(), GpuError> {
+        let workspace = self.allocate(WORKSPACE_BYTES)?;
+        let handle = *self.lane(lane).1.handle();
         // SAFETY: the workspace lives as long as the handle.
-        let status = unsafe {
-            blas_sys::cublasSetWorkspace_v2(*machine.blas.handle(), workspace as *mut c_void, WORKSPACE_BYTES)
-        };
-        status.result().map_err(failed("giving cuBLAS memory"))?;
-        let mode = match precision {
+        unsafe { blas_sys::cublasSetWorkspace_v2(handle, workspace as *mut c_void, WORKSPACE_BYTES) }
+            .result()
+            .map_err(failed("giving cuBLAS memory"))?;
+        let mode = match self.precision {
             Precision::F32 | Precision::Bf16 => blas_sys::cublasMath_t::CUBLAS_DEFAULT_MATH,
             Precision::Tf32 => blas_sys::cublasMath_t::CUBLAS_TF32_TENSOR_OP_MATH,
         };
         // SAFETY: the handle is alive.
-        unsafe { blas_sys::cublasSetMathMode(*machine.blas.handle(), mode) }
+        unsafe { blas_sys::cublasSetMathMode(handle, mode) }
             .result()
-            .map_err(failed("choosing cuBLAS's precision"))?;
-        Ok(machine)
+            .map_err(failed("choosing cuBLAS's precision"))
+    }
+
+    fn lane(&self, lane: Lane) -> (&Arc<CudaStream>, &CudaBlas) {
+        match lane {
+            Lane::Main => (&self.stream, &self.blas),
+            Lane::Side => (&self.side.0, &self.side.1),
+        }
     }
 
     pub(super) fn name(&self) -> String {
@@ -175,7 +193,7 @@ impl Nvidia {
             self.stream.synchronize().map_err(failed("waiting"))?;
             let mode = sys::CUstreamCaptureMode::CU_STREAM_CAPTURE_MODE_THREAD_LOCAL;
             self.stream.begin_capture(mode).map_err(failed("beginning a capture"))?;
-            let captured = program.commands.iter().try_for_each(|(_, command)| self.execute(command));
+            let captured = program.items.iter().try_for_each(|item| self.execute(&item.command, item.lane));
             let made = self.stream.end_capture(sys::CUgraphInstantiate_flags(0));
             captured?;
             let made = made.map_err(failed("capturing a program"))?;
@@ -195,13 +213,13 @@ impl Nvidia {
             machine.stream.record_event(flags).map_err(failed("recording an event"))
         };
         let mut spans: Vec<(u16, CudaEvent)> = Vec::new();
-        for (part, command) in &program.commands {
-            if spans.last().is_none_or(|(last, _)| last != part) {
-                spans.push((*part, event(self)?));
+        for item in program.items.iter().filter(|item| item.command != Command::HandOver) {
+            if spans.last().is_none_or(|(last, _)| *last != item.part) {
+                spans.push((item.part, event(self)?));
             }
-            self.execute(command)?;
-            times[usize::from(*part)].commands += 1;
-            times[usize::from(*part)].flops += flops(command);
+            self.execute(&item.command, Lane::Main)?;
+            times[usize::from(item.part)].commands += 1;
+            times[usize::from(item.part)].flops += flops(&item.command);
         }
         let end = event(self)?;
         self.stream.synchronize().map_err(failed("running a program"))?;
@@ -218,9 +236,10 @@ impl Nvidia {
         const REPEATS: u32 = 20;
         let mut kinds: Vec<(String, &Command, usize, &'static str)> = Vec::new();
         let mut places: HashMap<String, usize> = HashMap::new();
-        for (part, command) in &program.commands {
+        for item in program.items.iter().filter(|item| item.command != Command::HandOver) {
+            let command = &item.command;
             let name = describe(command);
-            let part = program.parts[usize::from(*part)];
+            let part = program.parts[usize::from(item.part)];
             let key = format!("{part} {name}");
             match places.get(&key) {
                 Some(at) => kinds[*at].2 += 1,
@@ -232,11 +251,11 @@ impl Nvidia {
         }
         let mut times = Vec::with_capacity(kinds.len());
         for (name, command, count, part) in kinds {
-            self.execute(command)?;
+            self.execute(command, Lane::Main)?;
             let flags = Some(sys::CUevent_flags::CU_EVENT_DEFAULT);
             let begin = self.stream.record_event(flags).map_err(failed("recording an event"))?;
             for _ in 0..REPEATS {
-                self.execute(command)?;
+                self.execute(command, Lane::Main)?;
             }
             let end = self.stream.record_event(flags).map_err(failed("recording an event"))?;
             end.synchronize().map_err(failed("running a command"))?;
@@ -247,7 +266,8 @@ impl Nvidia {
         Ok(times)
     }
 
-    fn execute(&self, command: &Command) -> Result<(), GpuError> {
+    fn execute(&self, command: &Command, lane: Lane) -> Result<(), GpuError> {
+        let (stream, _) = self.lane(lane);
         match command {
             Command::Kernel { kernel, grid, p, n, f } => {
                 let args = Args::new(p, n, f);
@@ -256,18 +276,22 @@ impl Nvidia {
                     block_dim: (grid.threads as u32, 1, 1),
                     shared_mem_bytes: grid.shared_bytes as u32,
                 };
-                let mut launch = self.stream.launch_builder(&self.kernels[kernel]);
+                let mut launch = stream.launch_builder(&self.kernels[kernel]);
                 launch.arg(&args);
                 // SAFETY: the arguments are those that the kernel's description names, and its buffers are as large as its counts say.
                 unsafe { launch.launch(config) }
                     .map_err(|error| GpuError::Failed { what: kernel.name(), reason: format!("{error}") })?;
                 Ok(())
             }
-            Command::Product(product) => self.multiply(product),
+            Command::HandOver => {
+                let event = stream.record_event(None).map_err(failed("handing over"))?;
+                self.lane(lane.other()).0.wait(&event).map_err(failed("handing over"))
+            }
+            Command::Product(product) => self.multiply(product, lane),
         }
     }
 
-    fn multiply(&self, p: &Product) -> Result<(), GpuError> {
+    fn multiply(&self, p: &Product, lane: Lane) -> Result<(), GpuError> {
         use blas_sys::cublasOperation_t::{CUBLAS_OP_N, CUBLAS_OP_T};
         let (m, n, k) = p.sizes();
         let operation = |transposed: bool| if transposed { CUBLAS_OP_T } else { CUBLAS_OP_N };
@@ -282,7 +306,7 @@ impl Nvidia {
         // SAFETY: the matrices' sizes were checked when the product was added, and they lie in this machine's memory.
         unsafe {
             blas::gemm_ex(
-                *self.blas.handle(),
+                *self.lane(lane).1.handle(),
                 operation(p.b_transposed),
                 operation(p.a_transposed),
                 n as i32,
@@ -310,7 +334,11 @@ impl Nvidia {
 /// A command by what its time depends on.
 fn describe(command: &Command) -> String {
     match command {
-        Command::Kernel { kernel, grid, .. } => format!("{} {}x{}", kernel.name(), grid.blocks, grid.threads),
+        Command::HandOver => String::new(),
+        Command::Kernel { kernel, grid, n, .. } => {
+            let sizes: Vec<String> = n.iter().take(3).map(i64::to_string).collect();
+            format!("{} {}x{} {}", kernel.name(), grid.blocks, grid.threads, sizes.join(","))
+        }
         Command::Product(product) => {
             let (m, n, k) = product.sizes();
             let letter = |transposed: bool| if transposed { 't' } else { 'n' };
