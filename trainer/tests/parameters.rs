@@ -58,7 +58,7 @@ fn weights_start_as_the_definition_says() {
                 assert!(values.iter().any(|value| *value != values[0]), "{name}");
             }
             if name.starts_with("interaction.") && name.ends_with("weight") && !name.contains("norm") {
-                assert!(values.iter().all(|value| value.abs() < 0.006), "{name}");
+                support::assert_full_scale(name, &values);
             }
             if let Some(rest) = name.strip_prefix("slow_") {
                 assert_eq!(values, self::values(&parameters, rest), "the slow critic starts as a copy");

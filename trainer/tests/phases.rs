@@ -113,6 +113,23 @@ fn a_reset_draws_exactly_its_parts_anew_and_leaves_every_other_bit() {
 }
 
 #[test]
+fn a_reset_draws_the_interaction_anew_at_full_scale() {
+    let source = pretrained(ModelKind::Rcwm);
+    for (_, var) in source.parameters.iter().filter(|(name, _)| name.starts_with("interaction.")) {
+        var.set(&var.zeros_like().unwrap()).unwrap();
+    }
+    let started = start_from(&source, &ResetSettings::default(), 7, &Device::Cpu).unwrap();
+    for layer in ["deter", "query", "key", "value", "output"] {
+        let values = |kind: &str| {
+            let var = started.get(&format!("interaction.{layer}.{kind}")).unwrap();
+            var.flatten_all().unwrap().to_vec1::<f32>().unwrap()
+        };
+        support::assert_full_scale(layer, &values("weight"));
+        assert!(values("bias").iter().all(|value| *value == 0.0), "{layer}");
+    }
+}
+
+#[test]
 fn the_actor_and_both_critics_start_anew_unless_they_are_kept() {
     for kind in [ModelKind::Rcwm, ModelKind::Vanilla] {
         let source = pretrained(kind);

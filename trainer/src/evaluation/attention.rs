@@ -286,9 +286,9 @@ mod tests {
             assert!((row.iter().sum::<f32>() - 1.0).abs() < 1e-5);
         }
         let summary = film.summary();
-        // Fresh weights are almost zero: every row gets the same.
         let even = k as f64 / (n + k) as f64;
-        assert!(summary.share_of_h.iter().all(|share| (share - even).abs() < 1e-3), "{summary:?}");
+        assert!(summary.share_of_h.iter().all(|share| (share - even).abs() < 0.5 * even), "{summary:?}");
+        assert!(summary.largest.iter().all(|weight| *weight > 1.1 / (n + k) as f64), "fresh weights choose");
         let strip = film.strip(4).unwrap();
         assert!(strip.width() > 3 * CELL && strip.height() > 5 * CELL);
     }

@@ -7,7 +7,7 @@ use rand_distr::StandardNormal;
 /// Distribution of a parameter's first values.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub enum Init {
-    /// Hidden layers: normal with `std = sqrt(2 / (in + out)) / 0.8796`, redrawn beyond 2 std. The divisor gives back the
+    /// Hidden layers and the interaction model's: normal with `std = sqrt(2 / (in + out)) / 0.8796`, redrawn beyond 2 std. The divisor gives back the
     /// spread that the cut takes. Fans count the kernel area.
     TruncatedNormal {
         /// `in + out`.
@@ -19,11 +19,6 @@ pub enum Init {
         fans: usize,
         /// Scale of the variance.
         scale: f64,
-    },
-    /// The interaction model's layers.
-    Normal {
-        /// Standard deviation.
-        std: f64,
     },
     /// Biases, the initial state.
     Zeros,
@@ -43,7 +38,6 @@ pub fn draw(init: &Init, shape: &[usize], seed: u64, name: &str) -> Vec<f32> {
             let std = (2.0 / fans as f64).sqrt() / 0.8796;
             (0..count).map(|_| (std * within_two(&mut normal)) as f32).collect()
         }
-        Init::Normal { std } => (0..count).map(|_| (std * normal()) as f32).collect(),
         Init::Uniform { fans, scale } => {
             let limit = (3.0 * scale * 2.0 / fans as f64).sqrt();
             (0..count).map(|_| ((generator.random::<f64>() * 2.0 - 1.0) * limit) as f32).collect()

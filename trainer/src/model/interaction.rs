@@ -31,8 +31,9 @@ impl Interaction {
     /// Those of [`Scope::get`].
     pub fn new(scope: &Scope<'_>, settings: &ModelSettings) -> Built<Self> {
         let (d, m) = (settings.deter, settings.classes);
-        let linear =
-            |name: &str, width| Linear::new(&scope.at(name), width, width, Init::Normal { std: 0.001 });
+        let linear = |name: &str, width: usize| {
+            Linear::new(&scope.at(name), width, width, Init::TruncatedNormal { fans: 2 * width })
+        };
         Ok(Self {
             deter: linear("deter", d)?,
             query: linear("query", m)?,

@@ -45,3 +45,11 @@ fn settings(model: ModelSettings) -> CheckpointSettings {
         model,
     }
 }
+
+/// Asserts that a square weight has the spread of a dense layer's start: `std = 1 / sqrt(width)`, cut at two of the uncut distribution.
+pub fn assert_full_scale(name: &str, weight: &[f32]) {
+    let std = (weight.len() as f64).powf(-0.25);
+    let spread = (weight.iter().map(|x| f64::from(*x).powi(2)).sum::<f64>() / weight.len() as f64).sqrt();
+    assert!((0.8..1.2).contains(&(spread / std)), "{name}: spread {spread}, expected about {std}");
+    assert!(weight.iter().all(|x| f64::from(x.abs()) <= 2.0 * std / 0.8796 + 1e-6), "{name}");
+}
