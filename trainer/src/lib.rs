@@ -11,6 +11,7 @@
 //! | [`replay`] | experience in memory, batches drawn from it |
 //! | [`simulators`] | Meta-World processes: started, joined, recorded |
 //! | [`training`] | runs: phases, metrics, checkpoints, resuming |
+//! | [`spectrum`] | singular values and effective ranks of weights |
 //! | [`checkpoint`] | weights and settings on disk |
 //! | [`export`] | the bundle that a runtime deploys |
 //! | [`parity`] | our numbers against the authors' |
@@ -35,4 +36,5 @@ pub mod plots;
 pub mod replay;
 pub mod report;
 pub mod simulators;
+pub mod spectrum;
 pub mod training;

@@ -4,6 +4,7 @@
 
 mod support;
 
+use assert_cmd::Command;
 use candle_core::{DType, Device, Tensor};
 use rcwm_models::settings::{ModelKind, ModelSettings, Preset};
 use rcwm_trainer::model::agent::{self, Agent};
@@ -179,4 +180,39 @@ fn imagination_and_filtering_agree_where_no_image_is_seen() {
         let largest = difference.abs().unwrap().flatten_all().unwrap().max(0).unwrap();
         assert!(largest.to_scalar::<f32>().unwrap() < 1e-5, "{kind:?}: {largest}");
     }
+}
+
+fn parameters_verb(arguments: &[&std::path::Path]) -> std::process::Output {
+    let mut command = Command::new(env!("CARGO_BIN_EXE_rcwm-trainer"));
+    command.arg("parameters").args(arguments).output().unwrap()
+}
+
+#[test]
+fn the_table_of_a_checkpoint_marks_what_is_of_rank_one() {
+    let folder = tempfile::tempdir().unwrap();
+    let (path, json) = (folder.path().join("checkpoint"), folder.path().join("table.json"));
+    let checkpoint = support::untrained(ModelKind::Rcwm, 1);
+    let deter = checkpoint.parameters.get("interaction.deter.weight").unwrap();
+    let column = deter.narrow(1, 0, 1).unwrap().detach();
+    deter.set(&column.matmul(&column.t().unwrap()).unwrap()).unwrap();
+    checkpoint.write(&path).unwrap();
+
+    let found = parameters_verb(&["--checkpoint".as_ref(), &path, "--json".as_ref(), &json]);
+    let table = String::from_utf8(found.stdout).unwrap();
+    let marked: Vec<_> = table.lines().filter(|line| line.contains("RANK 1")).collect();
+    assert!(matches!(marked[..], [line] if line.starts_with("interaction.deter.weight ")), "{table}");
+    let json: serde_json::Value = serde_json::from_slice(&std::fs::read(json).unwrap()).unwrap();
+    let of_rank_one = |matrix: &&serde_json::Value| matrix["flag"] == "rank-one";
+    let matrices = json["matrices"].as_array().unwrap();
+    assert_eq!(matrices.iter().find(of_rank_one).unwrap()["shape"], serde_json::json!([32, 32]));
+    let names = table.lines().filter(|line| line.contains(".weight ")).count();
+    assert_eq!(names, matrices.len(), "a line each");
+}
+
+#[test]
+fn a_folder_without_a_checkpoint_is_one_line_of_error() {
+    let found = parameters_verb(&["--checkpoint".as_ref(), "/nowhere".as_ref()]);
+    let error = String::from_utf8(found.stderr).unwrap();
+    assert!(!found.status.success() && found.stdout.is_empty());
+    assert!(error.lines().count() == 1 && error.contains("/nowhere/checkpoint.toml"), "{error}");
 }
