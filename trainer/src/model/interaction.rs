@@ -57,12 +57,26 @@ impl Interaction {
         robot_h: &Tensor,
         environment_z: &Tensor,
     ) -> Result<(Tensor, Tensor)> {
+        let (x, attention) = self.attend(robot_prior_z, robot_h, environment_z)?;
+        let e = self.norm.forward(&(environment_z + x)?)?; // [B, n, m]
+        Ok((e, attention))
+    }
+
+    /// What the environment receives from the robot, x = W_o softmax(Q K^T / sqrt(m)) V [B, n, m], and the attention map, from the same.
+    ///
+    /// # Errors
+    /// Those of candle.
+    pub fn attend(
+        &self,
+        robot_prior_z: &Tensor,
+        robot_h: &Tensor,
+        environment_z: &Tensor,
+    ) -> Result<(Tensor, Tensor)> {
         let g = self.deter.forward(robot_h)?.reshape(((), self.rows, self.classes))?; // [B, k, m]
         let u = Tensor::cat(&[robot_prior_z, &g], 1)?; // [B, n+k, m]
         let queries = self.query.forward(environment_z)?; // [B, n, m]
         let (keys, values) = (self.key.forward(&u)?, self.value.forward(&u)?); // [B, n+k, m]
         let (mixture, attention) = ops::cross_attention(&queries, &keys, &values)?;
-        let e = self.norm.forward(&(environment_z + self.output.forward(&mixture)?)?)?; // [B, n, m]
-        Ok((e, attention))
+        Ok((self.output.forward(&mixture)?, attention)) // [B, n, m]
     }
 }
