@@ -6,7 +6,7 @@
 //! one number.
 //!
 //! ```text
-//! interaction.deter   128x128   6.11  0.058  0.045   rank 1.1 of 128   rank 1
+//! interaction.deter.weight   128x128   6.11  0.0583  0.0446   3.6 of  128    3 %  <- RANK 1
 //! ```
 
 mod eigenvalues;

@@ -1,9 +1,9 @@
 use candle_core::{DType, Device, Result, Tensor};
-use rayon::prelude::*;
 use serde::Serialize;
 
 use super::{effective_rank, is_rank_one, singular_values};
 use crate::model::parameters::Parameters;
+use crate::ops;
 
 /// A row below this share of the median row's norm is a dead unit.
 const DEAD_NORM_SHARE: f64 = 1e-3;
@@ -66,12 +66,17 @@ pub struct MatrixSummary {
 /// # Errors
 /// Those of candle.
 pub fn summarise(parameters: &Parameters) -> Result<Vec<MatrixSummary>> {
-    let matrices: Vec<(&str, Tensor)> = parameters
+    let mut weights: Vec<(&str, Tensor)> = parameters
         .iter()
         .filter(|(name, var)| name.ends_with(".weight") && var.rank() >= 2)
         .map(|(name, var)| Ok((name, var.as_detached_tensor().to_device(&Device::Cpu)?)))
         .collect::<Result<_>>()?;
-    matrices.par_iter().with_max_len(1).map(|(name, weight)| MatrixSummary::of(name, weight)).collect()
+    // The largest first, so that no thread is left alone with one at the end.
+    weights.sort_by_key(|(_, weight)| std::cmp::Reverse(weight.elem_count()));
+    let summaries = ops::in_parallel(weights, |(name, weight)| MatrixSummary::of(name, &weight));
+    let mut summaries = summaries.into_iter().collect::<Result<Vec<_>>>()?;
+    summaries.sort_by(|a, b| a.name.cmp(&b.name));
+    Ok(summaries)
 }
 
 impl MatrixSummary {
