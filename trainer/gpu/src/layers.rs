@@ -253,7 +253,9 @@ impl Tape {
             let p = [&p[..], &[partial.into()]].concat();
             let grid = Grid { shared_bytes: 32 * THREADS, ..grid };
             tape.program.kernel(Kernel::NarrowBackward, grid, &p, &[x.rows, x.cols, usize::from(add)], &[]);
-            if let (Some(partial), Some(gain), Some(shift)) = (partial, norm.gain.gradient, norm.shift.gradient) {
+            if let (Some(partial), Some(gain), Some(shift)) =
+                (partial, norm.gain.gradient, norm.shift.gradient)
+            {
                 tape.add_partials(partial.pointer(), gain, blocks, 2 * x.cols, 0);
                 tape.add_partials(partial.pointer(), shift, blocks, 2 * x.cols, x.cols);
             }

@@ -277,8 +277,8 @@ impl Learner {
         Ok(())
     }
 
-    /// One update of the world model. `rate` is each parameter's learning rate, by name; `average` is the number of the update where the
-    /// running average follows. Where a loss or a gradient is not finite, nothing moves.
+    /// One update of the world model. `rate` is each parameter's learning rate, by name. The running average follows by the batch's number.
+    /// Where a loss or a gradient is not finite, nothing moves.
     ///
     /// # Errors
     /// [`GpuError::Failed`].
@@ -291,7 +291,12 @@ impl Learner {
         self.upload(batch, noise)?;
         self.upload_rates(0, rate)?;
         let number = batch.number as f64 + 1.0;
-        let keep = self.settings.average_decay.min((1.0 + number) / (10.0 + number));
+        // The average begins as the weights after the first update.
+        let keep = if number > 1.0 {
+            self.settings.average_decay.min((1.0 + number) / (10.0 + number))
+        } else {
+            0.0
+        };
         self.machine.upload(self.room.keep, &[keep as f32])?;
         let program = if batch.masks { &mut self.programs.masked } else { &mut self.programs.world };
         self.machine.run(program)?;

@@ -204,11 +204,8 @@ impl Product {
             return fours(self.b).then_some((Kernel::ProductFewRows, grid));
         }
         let warps = (k / 16).clamp(1, 16);
-        let grid = Grid {
-            blocks: groups * n.div_ceil(32),
-            threads: 32 * warps,
-            shared_bytes: 4 * warps * 16 * 32,
-        };
+        let grid =
+            Grid { blocks: groups * n.div_ceil(32), threads: 32 * warps, shared_bytes: 4 * warps * 16 * 32 };
         Some((Kernel::ProductFewRowsBack, grid))
     }
 

@@ -23,7 +23,9 @@ use std::sync::atomic::{AtomicBool, Ordering};
 use anyhow::{Context, Result};
 use candle_core::Device;
 use clap::{Parser, Subcommand, ValueEnum};
+use rcwm_gpu::{Machine, Precision};
 use rcwm_models::settings::{self, ModelKind, ModelSettings, Preset};
+use rcwm_trainer::training::Compute;
 
 /// Learns the Robo-Centric World Model and exports it.
 #[derive(Debug, Parser)]
@@ -149,6 +151,51 @@ fn parse_device(text: &str) -> Result<Device> {
             })
         }
         _ => anyhow::bail!("--device {text}: expected cpu, cuda or cuda:N"),
+    }
+}
+
+/// Where the updates of a run are computed.
+#[derive(Debug, clap::Args)]
+struct ComputeArguments {
+    /// Where updates are computed: cpu, cuda or cuda:N (an NVIDIA GPU; driver and CUDA 13 are looked
+    /// for when it is asked for)
+    #[arg(long, default_value = "cpu")]
+    device: String,
+    /// Precision of matrix products on a GPU: tf32 and bf16 round the factors, sums stay f32
+    #[arg(long, value_enum, default_value = "f32")]
+    precision: PrecisionName,
+}
+
+#[derive(Debug, Clone, Copy, PartialEq, Eq, ValueEnum)]
+enum PrecisionName {
+    F32,
+    Tf32,
+    Bf16,
+}
+
+impl ComputeArguments {
+    fn compute(&self) -> Result<Compute> {
+        let text = &self.device;
+        let precision = match self.precision {
+            PrecisionName::F32 => Precision::F32,
+            PrecisionName::Tf32 => Precision::Tf32,
+            PrecisionName::Bf16 => Precision::Bf16,
+        };
+        match text.split_once(':').unwrap_or((text, "0")) {
+            ("cpu", _) if self.precision != PrecisionName::F32 => {
+                anyhow::bail!(
+                    "--precision is of updates on a GPU: name one with --device cuda, or leave it out"
+                )
+            }
+            ("cpu", _) => Ok(Compute::Tensors(Device::Cpu)),
+            ("cuda", index) => {
+                let index = index.parse().with_context(|| format!("--device {text}: expected cuda:N"))?;
+                Ok(Compute::Programs(
+                    Machine::nvidia(index, precision).with_context(|| format!("--device {text}"))?,
+                ))
+            }
+            _ => anyhow::bail!("--device {text}: expected cpu, cuda or cuda:N"),
+        }
     }
 }
 

@@ -18,6 +18,8 @@ use super::bars::{self, absolute};
   rcwm-trainer pretrain --preset small --model vanilla --data data/upstream --out runs/vanilla \\
       --set replay.batch=4
   rcwm-trainer pretrain --out runs/small --resume --set pretrain.updates=40000
+  rcwm-trainer pretrain --preset paper --data data/upstream --out runs/paper --device cuda \\
+      --precision tf32
 
 Every setting and its value is in settings.toml of the run's folder; curves.png there and
 TensorBoard (tensorboard --logdir runs) show how it goes. replay.held_out_episodes of each task
@@ -46,14 +48,13 @@ pub struct Pretrain {
     /// Go on with the run in --out from its newest checkpoint
     #[arg(long)]
     resume: bool,
-    /// Where to compute: cpu, cuda or cuda:N
-    #[arg(long, default_value = "cpu")]
-    device: String,
+    #[command(flatten)]
+    compute: super::ComputeArguments,
 }
 
 impl Pretrain {
     pub fn run(self) -> Result<ExitCode> {
-        let device = super::parse_device(&self.device)?;
+        let compute = self.compute.compute()?;
         let stop = super::stop_on_ctrl_c()?;
         let settings = self.settings()?;
         settings.validate()?;
@@ -62,9 +63,9 @@ impl Pretrain {
         }
         let replay = load(&settings)?;
         let mut training = if self.resume {
-            Pretraining::resume(&self.out, settings.clone(), &device)?
+            Pretraining::resume(&self.out, settings.clone(), compute)?
         } else {
-            Pretraining::create(&self.out, settings.clone(), &device)?
+            Pretraining::create(&self.out, settings.clone(), compute)?
         };
         let bar = bars::updates(settings.pretrain.updates, training.updates());
         let outcome = training.run(replay, &stop, |progress| show(&bar, progress))?;

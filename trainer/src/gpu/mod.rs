@@ -12,6 +12,7 @@ use rcwm_gpu::learner::{AdamScales, Images, Noise};
 use rcwm_gpu::weights::{Array, Group};
 use rcwm_gpu::world::{Sizes, WorldScales};
 use rcwm_gpu::{BehaviourValues, GpuError, Learner, LearnerSettings, Machine, WorldValues};
+use rcwm_models::episode::Episode;
 use rcwm_models::settings::{ModelKind, ModelSettings};
 
 use crate::behaviour::{BehaviourSettings, BehaviourUpdate, ReturnRange};
@@ -199,6 +200,16 @@ impl GpuLearner {
         Ok(Adam::resumed(settings.clone(), all))
     }
 
+    /// Puts an episode's images, and its masks where they are stored, from `place` on.
+    ///
+    /// # Errors
+    /// [`LearningError`].
+    pub fn store(&mut self, place: u32, episode: &Episode) -> Result<(), LearningError> {
+        let images: Vec<u8> = episode.image.iter().copied().collect();
+        let masks: Vec<u8> = episode.robot_mask.iter().flatten().map(|robot| u8::from(*robot)).collect();
+        Ok(self.learner.store(place as usize, &images, &masks)?)
+    }
+
     /// One update of the world model from a batch.
     ///
     /// # Errors
@@ -305,7 +316,7 @@ fn on_gpu<'a>(batch: &'a HostBatch, images: Images<'a>, shift: &'a [[i32; 2]]) -
         reward: &batch.reward,
         terminal: &batch.terminal,
         first: &batch.first,
-        masks: !batch.robot_mask.is_empty(),
+        masks: batch.masks,
         number: batch.number,
         shift,
     }

@@ -53,8 +53,12 @@ pub struct HostBatch {
     pub rows: usize,
     /// T.
     pub length: usize,
-    /// B * T images.
+    /// B * T images; empty where `place` tells them.
     pub image: Vec<u8>,
+    /// B * T places of images in a store; empty where the images are here.
+    pub place: Vec<u32>,
+    /// Whether masks are used.
+    pub masks: bool,
     /// B * T actions.
     pub action: Vec<f32>,
     /// B * T rewards.
@@ -63,7 +67,7 @@ pub struct HostBatch {
     pub terminal: Vec<bool>,
     /// B * T flags.
     pub first: Vec<bool>,
-    /// B * T masks, 1 where the robot is; empty when masks are not used.
+    /// B * T masks, 1 where the robot is; empty when masks are not used, or stored.
     pub robot_mask: Vec<u8>,
     /// B * T flags.
     pub pushed: Vec<bool>,

@@ -70,6 +70,8 @@ pub enum Starts {
 pub(super) struct Stored {
     pub(super) episode: Arc<Episode>,
     number: u64,
+    /// Where its images begin in a store.
+    place: Option<u32>,
 }
 
 /// One task's episodes, oldest first.
@@ -131,7 +133,7 @@ impl Replay {
         let number = self.next_number;
         self.next_number += 1;
         let home = self.tasks.entry(task.to_owned()).or_default();
-        home.episodes.push_back(Stored { episode, number });
+        home.episodes.push_back(Stored { episode, number, place: None });
         home.steps += steps;
         self.steps += steps;
         Ok(())
@@ -148,6 +150,18 @@ impl Replay {
             self.steps -= oldest.episode.len();
         }
         self.tasks.retain(|_, task| !task.episodes.is_empty());
+    }
+
+    /// Gives the images of every episode a place in a store, from `from` on; the first place that is free. Batches name places from then
+    /// on, in place of images and masks.
+    pub fn place_images(&mut self, from: u32, mut put: impl FnMut(u32, &Arc<Episode>)) -> u32 {
+        let mut next = from;
+        for stored in self.tasks.values_mut().flat_map(|task| &mut task.episodes) {
+            put(next, &stored.episode);
+            stored.place = Some(next);
+            next += stored.episode.len() as u32;
+        }
+        next
     }
 
     /// The episodes that have robot masks; they share their memory with this replay's.
@@ -200,7 +214,7 @@ impl Replay {
         }
         let mut generator = ChaCha8Rng::seed_from_u64(seed);
         generator.set_stream(number);
-        let mut batch = HostBatch { rows, length, number, ..HostBatch::default() };
+        let mut batch = HostBatch { rows, length, number, masks, ..HostBatch::default() };
         let tasks: Vec<_> = self.tasks.iter().collect();
         // The turn goes on from batch to batch, so that shares are equal also where they do not divide a batch.
         let turn = (number % tasks.len() as u64) as usize * (rows % tasks.len());
@@ -240,9 +254,12 @@ impl Task {
         }
         let mut left = length;
         while left > 0 {
-            let episode = &self.episodes[index].episode;
+            let Stored { episode, place, .. } = &self.episodes[index];
             let count = left.min(episode.len() - step);
-            append_steps(name, episode, step, count, masks, batch)?;
+            match place {
+                Some(place) => append_places(name, episode, *place, step, count, batch)?,
+                None => append_steps(name, episode, step, count, masks, batch)?,
+            }
             left -= count;
             step = 0;
             index = (index + 1) % self.episodes.len();
@@ -265,18 +282,42 @@ pub fn append_steps(
 ) -> Result<(), ReplayError> {
     let range = ndarray::Slice::from(from..from + count);
     batch.image.extend(episode.image.slice_axis(Axis(0), range));
+    append_facts(episode, from, count, batch);
+    if masks {
+        batch.masks = true;
+        let mask = masks_of(name, episode)?;
+        batch.robot_mask.extend(mask.slice_axis(Axis(0), range).iter().map(|robot| u8::from(*robot)));
+    }
+    Ok(())
+}
+
+/// The same of an episode whose images and masks lie in a store from `place` on.
+fn append_places(
+    name: &str,
+    episode: &Episode,
+    place: u32,
+    from: usize,
+    count: usize,
+    batch: &mut HostBatch,
+) -> Result<(), ReplayError> {
+    batch.place.extend((from..from + count).map(|step| place + step as u32));
+    append_facts(episode, from, count, batch);
+    if batch.masks { masks_of(name, episode).map(drop) } else { Ok(()) }
+}
+
+fn masks_of<'a>(name: &str, episode: &'a Episode) -> Result<&'a ndarray::Array3<bool>, ReplayError> {
+    episode.robot_mask.as_ref().ok_or_else(|| ReplayError::NoMasks { task: name.to_owned() })
+}
+
+/// Everything of some steps but their pictures.
+fn append_facts(episode: &Episode, from: usize, count: usize, batch: &mut HostBatch) {
+    let range = ndarray::Slice::from(from..from + count);
     batch.action.extend(episode.action.slice_axis(Axis(0), range));
     batch.reward.extend(episode.reward.slice_axis(Axis(0), range));
     batch.terminal.extend(episode.is_terminal.slice_axis(Axis(0), range));
     // What a file does not say of its first step is true all the same: nothing came before it.
     batch.first.extend((from..from + count).map(|step| step == 0 || episode.is_first[step]));
     batch.pushed.extend(episode.pushed.slice_axis(Axis(0), range));
-    if masks {
-        let mask = episode.robot_mask.as_ref();
-        let mask = mask.ok_or_else(|| ReplayError::NoMasks { task: name.to_owned() })?;
-        batch.robot_mask.extend(mask.slice_axis(Axis(0), range).iter().map(|robot| u8::from(*robot)));
-    }
-    Ok(())
 }
 
 fn check(task: &str, episode: &Episode) -> Result<(), ReplayError> {

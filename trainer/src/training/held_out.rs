@@ -1,5 +1,6 @@
 use candle_core::Device;
 
+use super::compute::WorldUpdates;
 use super::{ReplaySettings, TrainingError};
 use crate::learning::{LossValues, WorldSettings, world_losses};
 use crate::model::agent::Agent;
@@ -32,6 +33,7 @@ impl HeldOut {
         sizes: &ReplaySettings,
         world: &WorldSettings,
         device: &Device,
+        updates: &mut WorldUpdates,
     ) -> Result<Option<LossValues>, TrainingError> {
         if self.replay.episodes() == 0 {
             return Ok(None);
@@ -39,6 +41,10 @@ impl HeldOut {
         let mut found = Vec::with_capacity(sizes.held_out_batches);
         for number in 0..sizes.held_out_batches as u64 {
             let batch = self.replay.draw(sizes.batch, sizes.length, false, self.seed, number)?;
+            if let Some(losses) = updates.judge(&batch, self.seed, number)? {
+                found.push(losses);
+                continue;
+            }
             let mut sampler = Sampler::numbered(self.seed, number);
             found.push(world_losses(agent, &batch.into_tensors(device)?, world, &mut sampler)?.values()?);
         }

@@ -36,6 +36,7 @@
 //! | `averages`, `online` | their lines of metrics and their progress |
 
 mod averages;
+mod compute;
 mod curves;
 mod demonstrations;
 mod fewshot;
@@ -55,6 +56,7 @@ mod tensorboard;
 mod weight_average;
 
 pub use averages::{Averages, Interval, Line, Spent};
+pub use compute::Compute;
 pub use demonstrations::demonstrations;
 pub use fewshot::{Fewshot, Stage};
 pub use film::{FilmSettings, film};

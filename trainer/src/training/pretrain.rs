@@ -4,13 +4,13 @@ use std::time::Instant;
 
 use candle_core::Device;
 
+use super::compute::{Compute, Made, WorldUpdates};
 use super::film::{Scene, write_films};
 use super::held_out::{HeldOut, mean_losses};
 use super::run::GoesOn;
 use super::{Best, HeldOutLosses, Metrics, Phase, Run, TrainingError, TrainingSettings, TrainingState};
-use crate::learning::{LossValues, Trained, WorldLearner, WorldUpdate};
+use crate::learning::{LossValues, Trained};
 use crate::model::agent::{self, Agent};
-use crate::model::latent::Sampler;
 use crate::model::parameters::Parameters;
 use crate::replay::{Prefetch, Replay};
 
@@ -26,7 +26,7 @@ pub struct Pretraining {
     device: Device,
     run: Run,
     parameters: Parameters,
-    learner: WorldLearner,
+    learner: WorldUpdates,
     state: TrainingState,
 }
 
@@ -57,38 +57,42 @@ impl Pretraining {
     ///
     /// # Errors
     /// See [`TrainingError`].
-    pub fn create(folder: &Path, settings: TrainingSettings, device: &Device) -> Result<Self, TrainingError> {
+    pub fn create(
+        folder: &Path,
+        settings: TrainingSettings,
+        compute: impl Into<Compute>,
+    ) -> Result<Self, TrainingError> {
         settings.validate()?;
         let run = Run::create(folder, &settings)?;
-        Self::fresh(run, settings, device)
+        Self::fresh(run, settings, compute.into())
     }
 
-    fn fresh(run: Run, settings: TrainingSettings, device: &Device) -> Result<Self, TrainingError> {
-        let parameters = agent::initialise(&settings.model, settings.seed, device)?;
-        let learner = WorldLearner::new(&parameters, &settings.model, &settings.world, Trained::World)?;
-        Ok(Self {
-            settings,
-            device: device.clone(),
-            run,
-            parameters,
-            learner,
-            state: TrainingState::default(),
-        })
+    fn fresh(run: Run, settings: TrainingSettings, compute: Compute) -> Result<Self, TrainingError> {
+        let device = compute.device();
+        let parameters = agent::initialise(&settings.model, settings.seed, &device)?;
+        let learner = WorldUpdates::new(compute, &settings, &parameters, None)?;
+        Ok(Self { settings, device, run, parameters, learner, state: TrainingState::default() })
     }
 
     /// Goes on with the run in `folder` from its newest checkpoint.
     ///
     /// # Errors
     /// See [`TrainingError`].
-    pub fn resume(folder: &Path, settings: TrainingSettings, device: &Device) -> Result<Self, TrainingError> {
+    pub fn resume(
+        folder: &Path,
+        settings: TrainingSettings,
+        compute: impl Into<Compute>,
+    ) -> Result<Self, TrainingError> {
+        let compute = compute.into();
+        let device = compute.device();
         let (run, parameters, state, moments) =
-            match Run::go_on(folder, &settings, &[Phase::Pretrain], device)? {
-                GoesOn::FromStart(run) => return Self::fresh(run, settings, device),
+            match Run::go_on(folder, &settings, &[Phase::Pretrain], &device)? {
+                GoesOn::FromStart(run) => return Self::fresh(run, settings, compute),
                 GoesOn::From { run, parameters, state, moments } => (run, parameters, state, moments),
             };
-        let mut learner = WorldLearner::new(&parameters, &settings.model, &settings.world, Trained::World)?;
-        *learner.adam_mut() = state.optimiser(WORLD, &settings.world.adam, &moments, &parameters)?;
-        Ok(Self { settings, device: device.clone(), run, parameters, learner, state })
+        let adam = state.optimiser(WORLD, &settings.world.adam, &moments, &parameters)?;
+        let learner = WorldUpdates::new(compute, &settings, &parameters, Some(adam))?;
+        Ok(Self { settings, device, run, parameters, learner, state })
     }
 
     /// Updates made so far.
@@ -119,7 +123,8 @@ impl Pretraining {
         stop: &AtomicBool,
         mut show: impl FnMut(&Progress<'_>),
     ) -> Result<Outcome, TrainingError> {
-        let (replay, held_out) = replay.hold_out(self.settings.replay.held_out_episodes);
+        let (mut replay, mut held_out) = replay.hold_out(self.settings.replay.held_out_episodes);
+        self.learner.begin(&self.settings, &self.parameters, &self.run, [&mut replay, &mut held_out])?;
         let judge = Judge::new(&self.settings, &replay, held_out);
         let mut batches = self.prefetch(replay)?;
         let mut interval = Interval::begin(&batches);
@@ -127,10 +132,11 @@ impl Pretraining {
         let mut saved_at = None;
         while self.state.updates < self.settings.pretrain.updates && !stop.load(Ordering::Relaxed) {
             let number = self.state.updates;
-            let batch = batches.next_batch()?.into_tensors(&self.device)?;
-            let update = self.learner.update(&batch, &mut Sampler::numbered(self.settings.seed, number))?;
+            let update = self.learner.update(batches.next_batch()?, self.settings.seed, number)?;
             self.state.updates += 1;
-            self.run.follow(&self.parameters, Trained::World.filter(), self.state.updates)?;
+            if self.learner.leaves_average() {
+                self.run.follow(&self.parameters, Trained::World.filter(), self.state.updates)?;
+            }
             interval.means.add(&update);
             since_checkpoint.add(&update);
             let metrics = self.state.updates.is_multiple_of(self.settings.metrics_every).then(|| {
@@ -172,9 +178,10 @@ impl Pretraining {
 
     /// Saves a checkpoint, then judges it, draws the curves and makes films.
     fn save(&mut self, since: Means, judge: &Judge) -> Result<Option<HeldOutLosses>, TrainingError> {
+        let adam = self.learner.write_back(&self.parameters, &mut self.run)?;
         let agent = Agent::new(&self.run.kept(&self.parameters).frozen(), &self.settings.model)?;
         let (sizes, world) = (&self.settings.replay, &self.settings.world);
-        let held_out = judge.held_out.losses(&agent, sizes, world, &self.device)?;
+        let held_out = judge.held_out.losses(&agent, sizes, world, &self.device, &mut self.learner)?;
         let best = match &held_out {
             Some(losses) => lower(Some(losses.total), &mut self.state.best_held_out_loss),
             None => lower(since.mask_free_loss(), &mut self.state.best_loss),
@@ -185,7 +192,7 @@ impl Pretraining {
         if let Some(line) = &line {
             self.run.log(line)?;
         }
-        let optimisers = [(WORLD, self.learner.adam())];
+        let optimisers = [(WORLD, &adam)];
         self.run.save(&self.parameters, &self.settings, &self.state, &optimisers, best)?;
         self.run.draw_curves(self.settings.pretrain.warm_up_updates)?;
         write_films(&self.run, &agent, &judge.scenes, &self.settings.film, update, &self.device)?;
@@ -236,7 +243,7 @@ struct Means {
 }
 
 impl Means {
-    fn add(&mut self, update: &WorldUpdate) {
+    fn add(&mut self, update: &Made) {
         self.losses.push((update.losses, update.gradient_norm));
     }
 

@@ -262,6 +262,23 @@ impl Run {
         self.average.as_ref().map_or(parameters, WeightAverage::weights).clone()
     }
 
+    /// The average to be set by whoever keeps it elsewhere while the run learns; none where none is kept.
+    ///
+    /// # Errors
+    /// Those of candle.
+    pub(super) fn average_of(
+        &mut self,
+        parameters: &Parameters,
+    ) -> Result<Option<Parameters>, TrainingError> {
+        if self.average_decay == 0.0 {
+            return Ok(None);
+        }
+        if self.average.is_none() {
+            self.average = Some(WeightAverage::of(parameters.copied()?, self.average_decay));
+        }
+        Ok(self.average.as_ref().map(|average| average.weights().clone()))
+    }
+
     /// Where films go; the folder is made.
     ///
     /// # Errors

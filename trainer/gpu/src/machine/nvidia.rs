@@ -121,7 +121,8 @@ impl Nvidia {
                 function.set_attribute(attribute, most).map_err(failed("asking for shared memory"))?;
             }
         }
-        let start = |stream: &Arc<CudaStream>| CudaBlas::new(stream.clone()).map_err(failed("starting cuBLAS"));
+        let start =
+            |stream: &Arc<CudaStream>| CudaBlas::new(stream.clone()).map_err(failed("starting cuBLAS"));
         let beside = context.new_stream().map_err(failed("making a stream"))?;
         let (blas, side) = (start(&stream)?, (beside.clone(), start(&beside)?));
         let mut machine = Self { stream, blas, side, kernels, memory: Vec::new(), precision };

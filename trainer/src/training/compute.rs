@@ -1,0 +1,176 @@
+//! Where a run's updates are computed, and who makes those of the world model.
+
+use std::sync::Arc;
+
+use candle_core::Device;
+use rcwm_gpu::Machine;
+use rcwm_gpu::learner::Images;
+use rcwm_gpu::weights::{Array, Group};
+use rcwm_models::episode::Episode;
+
+use super::{Run, TrainingError, TrainingSettings};
+use crate::gpu::{GpuLearner, GpuPlan, numbered_noise};
+use crate::learning::{Adam, HostBatch, LossValues, Trained, WorldLearner};
+use crate::model::latent::Sampler;
+use crate::model::parameters::Parameters;
+use crate::replay::Replay;
+
+/// Where updates are computed.
+#[derive(Debug)]
+pub enum Compute {
+    /// By candle's tensors and the fused ops.
+    Tensors(Device),
+    /// By programs of kernels. Everything that is no update, films for example, stays on the CPU.
+    Programs(Machine),
+}
+
+impl From<&Device> for Compute {
+    fn from(device: &Device) -> Self {
+        Self::Tensors(device.clone())
+    }
+}
+
+impl Compute {
+    /// Where the run's tensors live.
+    #[must_use]
+    pub fn device(&self) -> Device {
+        match self {
+            Self::Tensors(device) => device.clone(),
+            Self::Programs(_) => Device::Cpu,
+        }
+    }
+}
+
+/// What one update of the world model said.
+#[derive(Debug, Clone, Copy)]
+pub(super) struct Made {
+    pub losses: LossValues,
+    pub gradient_norm: f64,
+}
+
+/// Who makes the world model's updates.
+#[derive(Debug)]
+pub(super) enum WorldUpdates {
+    Tensors {
+        learner: Box<WorldLearner>,
+        device: Device,
+    },
+    /// The programs are laid out when the replay is known.
+    Waiting {
+        machine: Machine,
+        adam: Adam,
+    },
+    Programs {
+        learner: Box<GpuLearner>,
+    },
+}
+
+impl WorldUpdates {
+    /// A learner of `parameters` whose optimiser goes on from `adam`.
+    pub fn new(
+        compute: Compute,
+        settings: &TrainingSettings,
+        parameters: &Parameters,
+        adam: Option<Adam>,
+    ) -> Result<Self, TrainingError> {
+        Ok(match compute {
+            Compute::Tensors(device) => {
+                let mut learner =
+                    WorldLearner::new(parameters, &settings.model, &settings.world, Trained::World)?;
+                if let Some(adam) = adam {
+                    *learner.adam_mut() = adam;
+                }
+                Self::Tensors { learner: Box::new(learner), device }
+            }
+            Compute::Programs(machine) => {
+                let adam = adam.unwrap_or_else(|| Adam::new(settings.world.adam.clone()));
+                Self::Waiting { machine, adam }
+            }
+        })
+    }
+
+    /// Takes the images of both replays to where the programs run.
+    pub fn begin(
+        &mut self,
+        settings: &TrainingSettings,
+        parameters: &Parameters,
+        run: &Run,
+        replays: [&mut Replay; 2],
+    ) -> Result<(), TrainingError> {
+        let (machine, adam) = match self {
+            Self::Waiting { machine, adam } => (std::mem::replace(machine, Machine::host()), adam.clone()),
+            Self::Tensors { .. } | Self::Programs { .. } => return Ok(()),
+        };
+        let mut steps = 0;
+        let mut episodes: Vec<(u32, Arc<Episode>)> = Vec::new();
+        for replay in replays {
+            steps = replay.place_images(steps, |place, episode| episodes.push((place, episode.clone())));
+        }
+        let masks = episodes.iter().any(|(_, episode)| episode.robot_mask.is_some());
+        let plan = GpuPlan {
+            model: &settings.model,
+            batch: (settings.replay.batch, settings.replay.length),
+            world: &settings.world,
+            behaviour: None,
+            average_decay: settings.average_decay,
+            stored: (steps.max(1) as usize, masks),
+        };
+        let mut learner = GpuLearner::new(machine, &plan, parameters)?;
+        learner.load(Array::Average, &run.kept(parameters))?;
+        learner.resume(&adam)?;
+        for (place, episode) in episodes {
+            learner.store(place, &episode)?;
+        }
+        *self = Self::Programs { learner: Box::new(learner) };
+        Ok(())
+    }
+
+    /// One update from a batch with the noise of this number.
+    pub fn update(&mut self, batch: HostBatch, seed: u64, number: u64) -> Result<Made, TrainingError> {
+        match self {
+            Self::Tensors { learner, device } => {
+                let batch = batch.into_tensors(device)?;
+                let update = learner.update(&batch, &mut Sampler::numbered(seed, number))?;
+                Ok(Made { losses: update.losses, gradient_norm: update.gradient_norm })
+            }
+            Self::Programs { learner } => {
+                let images = Images::Stored(&batch.place);
+                let update = learner.update_world_from(&batch, images, &[], numbered_noise(seed, number))?;
+                Ok(Made { losses: update.losses, gradient_norm: update.gradient_norm })
+            }
+            Self::Waiting { .. } => unreachable!("a run begins before it updates"),
+        }
+    }
+
+    /// The losses of a batch, where the programs run; none where the trainer's own model must be asked.
+    pub fn judge(
+        &mut self,
+        batch: &HostBatch,
+        seed: u64,
+        number: u64,
+    ) -> Result<Option<LossValues>, TrainingError> {
+        let Self::Programs { learner } = self else { return Ok(None) };
+        let images = Images::Stored(&batch.place);
+        Ok(Some(learner.judge_world(batch, images, numbered_noise(seed, number))?))
+    }
+
+    /// Brings the weights to `parameters`, and their average to the run's, before a checkpoint; the optimiser as it is now.
+    pub fn write_back(&mut self, parameters: &Parameters, run: &mut Run) -> Result<Adam, TrainingError> {
+        match self {
+            Self::Tensors { learner, .. } => Ok(learner.adam().clone()),
+            Self::Waiting { adam, .. } => Ok(adam.clone()),
+            Self::Programs { learner } => {
+                learner.write_back(Array::Values, parameters)?;
+                if let Some(average) = run.average_of(parameters)? {
+                    learner.write_back(Array::Average, &average)?;
+                }
+                Ok(learner.adam(Group::World, parameters)?)
+            }
+        }
+    }
+
+    /// Whether the run's average must be moved after an update; programs move their own.
+    pub fn leaves_average(&self) -> bool {
+        matches!(self, Self::Tensors { .. })
+    }
+}
