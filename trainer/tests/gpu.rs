@@ -54,8 +54,10 @@ fn batch(rows: usize, length: usize, masks: bool, number: u64) -> HostBatch {
         terminal,
         first,
         robot_mask,
+        masks,
         pushed: vec![false; steps],
         number,
+        ..HostBatch::default()
     }
 }
 

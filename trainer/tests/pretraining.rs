@@ -8,12 +8,13 @@ use std::sync::atomic::{AtomicBool, Ordering};
 
 use candle_core::Device;
 use ndarray::{Array2, Array3, Array4};
+use rcwm_gpu::{Machine, Precision};
 use rcwm_models::episode::Episode;
 use rcwm_models::settings::{ModelKind, Preset};
 use rcwm_trainer::checkpoint::Checkpoint;
 use rcwm_trainer::model::parameters::Parameters;
 use rcwm_trainer::replay::Replay;
-use rcwm_trainer::training::{Outcome, Pretraining, Progress, Run, TrainingError, TrainingSettings};
+use rcwm_trainer::training::{Compute, Outcome, Pretraining, Progress, Run, TrainingError, TrainingSettings};
 
 /// A bright square, the robot, that moves over a dark ground with the action.
 fn episode(steps: usize, shift: usize, masked: bool) -> Episode {
@@ -80,20 +81,68 @@ fn event_files(folder: &Path) -> usize {
     names.filter(|name| name.contains("tfevents")).count()
 }
 
+fn tensors() -> Compute {
+    (&Device::Cpu).into()
+}
+
+fn programs() -> Compute {
+    Compute::Programs(Machine::host())
+}
+
 #[test]
 fn a_resumed_run_gives_the_same_weights_as_one_that_never_stopped() {
+    resumed_is_the_same_as_whole(tensors);
+}
+
+#[test]
+fn a_resumed_run_of_programs_gives_the_same_weights_too() {
+    resumed_is_the_same_as_whole(programs);
+}
+
+#[test]
+fn a_resumed_run_on_a_gpu_gives_the_same_weights_too() {
+    match Machine::nvidia(0, Precision::F32) {
+        Ok(_) => {
+            resumed_is_the_same_as_whole(|| Compute::Programs(Machine::nvidia(0, Precision::F32).unwrap()))
+        }
+        Err(error) => eprintln!("not run: no GPU ({error})"),
+    }
+}
+
+#[test]
+fn programs_learn_what_tensors_learn() {
+    let folder = tempfile::tempdir().unwrap();
+    let run = |name: &str, compute: Compute| {
+        let mut training =
+            Pretraining::create(&folder.path().join(name), settings(ModelKind::Rcwm, 7), compute).unwrap();
+        train(&mut training);
+        (lines(&folder.path().join(name), false), lines(&folder.path().join(name), true))
+    };
+    let (tensors, programs) = (run("tensors", tensors()), run("programs", programs()));
+    let pairs = tensors.0.iter().zip(&programs.0).chain(tensors.1.iter().zip(&programs.1));
+    for (expected, found) in pairs {
+        let total = |line: &serde_json::Value| {
+            line.get("held_out").unwrap_or(&line["losses"])["total"].as_f64().unwrap()
+        };
+        let (expected, found) = (total(expected), total(found));
+        assert!((found - expected).abs() <= 1e-3 * expected.abs(), "{found}, expected {expected}");
+    }
+    assert_eq!(tensors.0.len(), programs.0.len());
+}
+
+fn resumed_is_the_same_as_whole(compute: impl Fn() -> Compute) {
     for kind in [ModelKind::Rcwm, ModelKind::Vanilla] {
         let folder = tempfile::tempdir().unwrap();
         let (whole, halves) = (folder.path().join("whole"), folder.path().join("halves"));
-        let mut training = Pretraining::create(&whole, settings(kind, 12), &Device::Cpu).unwrap();
+        let mut training = Pretraining::create(&whole, settings(kind, 12), compute()).unwrap();
         assert_eq!(train(&mut training), Outcome { updates: 12, interrupted: false });
         let expected = bits(training.parameters());
 
-        let mut first = Pretraining::create(&halves, settings(kind, 6), &Device::Cpu).unwrap();
+        let mut first = Pretraining::create(&halves, settings(kind, 6), compute()).unwrap();
         train(&mut first);
         assert_ne!(bits(first.parameters()), expected);
         drop(first);
-        let mut second = Pretraining::resume(&halves, settings(kind, 12), &Device::Cpu).unwrap();
+        let mut second = Pretraining::resume(&halves, settings(kind, 12), compute()).unwrap();
         assert_eq!(second.updates(), 6);
         train(&mut second);
         assert!(bits(second.parameters()) == expected, "{kind:?}: not the same bits");

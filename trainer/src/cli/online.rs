@@ -47,9 +47,8 @@ pub struct Online {
     /// Go on with the run in --out from its newest checkpoint; the simulators begin new episodes
     #[arg(long)]
     pub resume: bool,
-    /// Where to compute: cpu, cuda or cuda:N
-    #[arg(long, default_value = "cpu")]
-    pub device: String,
+    #[command(flatten)]
+    compute: super::ComputeArguments,
 }
 
 impl Online {
@@ -59,7 +58,7 @@ impl Online {
         source: Option<&Checkpoint>,
         begin: impl FnOnce() -> Result<TrainingSettings>,
     ) -> Result<ExitCode> {
-        let device = super::parse_device(&self.device)?;
+        let compute = self.compute.compute()?;
         let stop = super::stop_on_ctrl_c()?;
         if !self.resume && self.out.join("settings.toml").exists() {
             return Err(TrainingError::Exists { path: self.out.clone() }.into());
@@ -67,20 +66,19 @@ impl Online {
         let settings = self.settings(begin)?;
         settings.validate()?;
         let mut training = if self.resume {
-            Finetuning::resume(&self.out, settings.clone(), &device)?
+            Finetuning::resume(&self.out, settings.clone(), compute)?
         } else {
-            Finetuning::create(&self.out, settings.clone(), source, &device)?
+            Finetuning::create(&self.out, settings.clone(), source, compute)?
         };
         let outcome = self.work(&mut training, &settings, &stop)?;
         self.summarise(&settings, &outcome);
         Ok(ExitCode::SUCCESS)
     }
 
-    /// The device and, for a new run, the checkpoint that it starts from.
+    /// For a new run, the checkpoint that it starts from.
     pub fn source(&self, from: Option<&Path>) -> Result<Option<Checkpoint>> {
-        let device: Device = super::parse_device(&self.device)?;
         match (from, self.resume) {
-            (Some(from), false) => Ok(Some(Checkpoint::read(from, &device)?)),
+            (Some(from), false) => Ok(Some(Checkpoint::read(from, &Device::Cpu)?)),
             _ => Ok(None),
         }
     }

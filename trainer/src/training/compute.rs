@@ -1,4 +1,4 @@
-//! Where a run's updates are computed, and who makes those of the world model.
+//! Where a run's updates are computed, and who makes them.
 
 use std::sync::Arc;
 
@@ -9,6 +9,7 @@ use rcwm_gpu::weights::{Array, Group};
 use rcwm_models::episode::Episode;
 
 use super::{Run, TrainingError, TrainingSettings};
+use crate::behaviour::{BehaviourLearner, BehaviourUpdate, ReturnRange};
 use crate::gpu::{GpuLearner, GpuPlan, numbered_noise};
 use crate::learning::{Adam, HostBatch, LossValues, Trained, WorldLearner};
 use crate::model::latent::Sampler;
@@ -171,6 +172,130 @@ impl WorldUpdates {
 
     /// Whether the run's average must be moved after an update; programs move their own.
     pub fn leaves_average(&self) -> bool {
+        matches!(self, Self::Tensors { .. })
+    }
+}
+
+/// Who makes the updates of a run that acts: world model, actor and critic.
+#[derive(Debug)]
+pub(super) enum AgentUpdates {
+    Tensors { world: Box<WorldLearner>, behaviour: Box<BehaviourLearner>, device: Device },
+    Programs { learner: Box<GpuLearner>, range: ReturnRange },
+}
+
+impl AgentUpdates {
+    /// Learners of `parameters` that have seen nothing.
+    pub fn new(
+        compute: Compute,
+        settings: &TrainingSettings,
+        parameters: &Parameters,
+    ) -> Result<Self, TrainingError> {
+        let TrainingSettings { model, world, behaviour, .. } = settings;
+        Ok(match compute {
+            Compute::Tensors(device) => Self::Tensors {
+                world: Box::new(WorldLearner::new(parameters, model, world, Trained::World)?),
+                behaviour: Box::new(BehaviourLearner::new(parameters, model, behaviour)?),
+                device,
+            },
+            Compute::Programs(machine) => {
+                let plan = GpuPlan {
+                    model,
+                    batch: (settings.replay.batch, settings.replay.length),
+                    world,
+                    behaviour: Some(behaviour),
+                    average_decay: 0.0,
+                    stored: (0, false),
+                };
+                let learner = Box::new(GpuLearner::new(machine, &plan, parameters)?);
+                Self::Programs { learner, range: ReturnRange::default() }
+            }
+        })
+    }
+
+    /// Goes on from the optimisers of world model, actor and critic, and the returns' range.
+    pub fn resume(&mut self, adams: [Adam; 3], range: ReturnRange) -> Result<(), TrainingError> {
+        match self {
+            Self::Tensors { world, behaviour, .. } => {
+                let [of_world, actor, critic] = adams;
+                *world.adam_mut() = of_world;
+                behaviour.resume(actor, critic, range);
+            }
+            Self::Programs { learner, range: here } => {
+                for adam in &adams {
+                    learner.resume(adam)?;
+                }
+                learner.resume_range(range)?;
+                *here = range;
+            }
+        }
+        Ok(())
+    }
+
+    /// One update of the world model, and of actor and critic where `behaves`, with the noise of this number.
+    pub fn update(
+        &mut self,
+        batch: HostBatch,
+        (seed, number): (u64, u64),
+        behaves: bool,
+    ) -> Result<(Made, Option<BehaviourUpdate>), TrainingError> {
+        match self {
+            Self::Tensors { world, behaviour, device } => {
+                let batch = batch.into_tensors(device)?;
+                let mut sampler = Sampler::numbered(seed, number);
+                let update = world.update(&batch, &mut sampler)?;
+                let made = Made { losses: update.losses, gradient_norm: update.gradient_norm };
+                if !behaves {
+                    return Ok((made, None));
+                }
+                let start = update.posteriors.map(|x| x.flatten(0, 1))?; // [B*T, ...]
+                Ok((made, Some(behaviour.update(&start, &mut sampler)?)))
+            }
+            Self::Programs { learner, range } => {
+                let update = learner.update_world(&batch, numbered_noise(seed, number))?;
+                let made = Made { losses: update.losses, gradient_norm: update.gradient_norm };
+                if !behaves {
+                    return Ok((made, None));
+                }
+                let (behaviour, now) = learner.update_behaviour()?;
+                *range = now;
+                Ok((made, Some(behaviour)))
+            }
+        }
+    }
+
+    /// Brings the weights to `parameters`, where they are elsewhere.
+    pub fn write_back(&mut self, parameters: &Parameters) -> Result<(), TrainingError> {
+        match self {
+            Self::Tensors { .. } => Ok(()),
+            Self::Programs { learner, .. } => Ok(learner.write_back(Array::Values, parameters)?),
+        }
+    }
+
+    /// The optimisers of world model, actor and critic as they are now.
+    pub fn adams(&mut self, parameters: &Parameters) -> Result<[Adam; 3], TrainingError> {
+        match self {
+            Self::Tensors { world, behaviour, .. } => {
+                let [actor, critic] = behaviour.adams();
+                Ok([world.adam().clone(), actor.clone(), critic.clone()])
+            }
+            Self::Programs { learner, .. } => Ok([
+                learner.adam(Group::World, parameters)?,
+                learner.adam(Group::Actor, parameters)?,
+                learner.adam(Group::Critic, parameters)?,
+            ]),
+        }
+    }
+
+    /// The returns' running range.
+    pub fn return_range(&self) -> ReturnRange {
+        match self {
+            Self::Tensors { behaviour, .. } => behaviour.return_range(),
+            Self::Programs { range, .. } => *range,
+        }
+    }
+
+    /// Whether the trainer's parameters are what is trained, and so never older than it.
+    pub fn shares_parameters(&self) -> bool {
         matches!(self, Self::Tensors { .. })
     }
 }

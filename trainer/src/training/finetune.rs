@@ -5,15 +5,14 @@ use std::sync::atomic::{AtomicBool, Ordering};
 use candle_core::Device;
 use serde_json::json;
 
+use super::compute::{AgentUpdates, Compute};
 use super::film::{Scene, write_films};
 use super::prefill::{Prefilled, policy_episode, prefill};
 use super::run::GoesOn;
 use super::{EpisodeFacts, EpisodeLine, OnlineOutcome, OnlineProgress};
 use super::{Interval, Phase, Run, Spent, TrainingError, TrainingSettings, TrainingState, start_from};
 use crate::acting::{Fleet, Gathered, Policy, Recorded};
-use crate::behaviour::BehaviourLearner;
 use crate::checkpoint::Checkpoint;
-use crate::learning::{Trained, WorldLearner};
 use crate::model::agent::{self, Agent};
 use crate::model::latent::Sampler;
 use crate::model::parameters::{ParameterError, Parameters};
@@ -44,8 +43,7 @@ pub struct Finetuning {
     folder: PathBuf,
     run: Run,
     parameters: Parameters,
-    world: WorldLearner,
-    behaviour: BehaviourLearner,
+    updates: AgentUpdates,
     state: TrainingState,
     newest: VecDeque<bool>,
     refused_actions: u64,
@@ -61,14 +59,14 @@ impl Finetuning {
         folder: &Path,
         settings: TrainingSettings,
         source: Option<&Checkpoint>,
-        device: &Device,
+        compute: impl Into<Compute>,
     ) -> Result<Self, TrainingError> {
         settings.validate()?;
         if source.is_some_and(|source| source.settings.model != settings.model) {
             return Err(TrainingError::OtherModel);
         }
         let run = Run::create(folder, &settings)?;
-        Self::fresh(folder, run, settings, source, device)
+        Self::fresh(folder, run, settings, source, compute.into())
     }
 
     fn fresh(
@@ -76,13 +74,14 @@ impl Finetuning {
         run: Run,
         settings: TrainingSettings,
         source: Option<&Checkpoint>,
-        device: &Device,
+        compute: Compute,
     ) -> Result<Self, TrainingError> {
+        let device = compute.device();
         let parameters = match source {
-            Some(source) => start_from(source, &settings.reset, settings.seed, device)?,
-            None => agent::initialise(&settings.model, settings.seed, device)?,
+            Some(source) => start_from(source, &settings.reset, settings.seed, &device)?,
+            None => agent::initialise(&settings.model, settings.seed, &device)?,
         };
-        Self::of(folder, run, settings, parameters, TrainingState::default(), device)
+        Self::of(folder, run, settings, parameters, TrainingState::default(), compute)
     }
 
     fn of(
@@ -91,18 +90,17 @@ impl Finetuning {
         settings: TrainingSettings,
         parameters: Parameters,
         state: TrainingState,
-        device: &Device,
+        compute: Compute,
     ) -> Result<Self, TrainingError> {
-        let world = WorldLearner::new(&parameters, &settings.model, &settings.world, Trained::World)?;
-        let behaviour = BehaviourLearner::new(&parameters, &settings.model, &settings.behaviour)?;
+        let device = compute.device();
+        let updates = AgentUpdates::new(compute, &settings, &parameters)?;
         Ok(Self {
             settings,
-            device: device.clone(),
+            device,
             folder: folder.to_path_buf(),
             run,
             parameters,
-            world,
-            behaviour,
+            updates,
             state,
             newest: VecDeque::new(),
             refused_actions: 0,
@@ -114,25 +112,32 @@ impl Finetuning {
     ///
     /// # Errors
     /// See [`TrainingError`].
-    pub fn resume(folder: &Path, settings: TrainingSettings, device: &Device) -> Result<Self, TrainingError> {
+    pub fn resume(
+        folder: &Path,
+        settings: TrainingSettings,
+        compute: impl Into<Compute>,
+    ) -> Result<Self, TrainingError> {
+        let compute = compute.into();
+        let device = compute.device();
         let phases = [Phase::Finetune, Phase::Train];
-        let (run, parameters, state, moments) = match Run::go_on(folder, &settings, &phases, device)? {
+        let (run, parameters, state, moments) = match Run::go_on(folder, &settings, &phases, &device)? {
             GoesOn::FromStart(run) => {
                 let source = match settings.phase {
-                    Phase::Finetune => Some(Checkpoint::read(&settings.from, device)?),
+                    Phase::Finetune => Some(Checkpoint::read(&settings.from, &device)?),
                     _ => None,
                 };
-                return Self::fresh(folder, run, settings, source.as_ref(), device);
+                return Self::fresh(folder, run, settings, source.as_ref(), compute);
             }
             GoesOn::From { run, parameters, state, moments } => (run, parameters, state, moments),
         };
-        let mut this = Self::of(folder, run, settings, parameters, state, device)?;
+        let mut this = Self::of(folder, run, settings, parameters, state, compute)?;
         let adam = |name: &str, settings| this.state.optimiser(name, settings, &moments, &this.parameters);
         let [world, actor, critic] = OPTIMISERS;
-        *this.world.adam_mut() = adam(world, &this.settings.world.adam)?;
+        let world = adam(world, &this.settings.world.adam)?;
         let actor = adam(actor, &this.settings.behaviour.actor)?;
         let critic = adam(critic, &this.settings.behaviour.critic)?;
-        this.behaviour.resume(actor, critic, this.state.return_range);
+        let range = this.state.return_range;
+        this.updates.resume([world, actor, critic], range)?;
         Ok(this)
     }
 
@@ -177,6 +182,7 @@ impl Finetuning {
         let replay = SharedReplay::new(filled.replay);
         let mut learning = Learning { batches: self.prefetch(&replay)?, interval: Interval::begin() };
         let done = self.work(&replay, &mut learning, join, stop, &mut show);
+        self.updates.write_back(&self.parameters)?;
         // Whatever happened: a model with a number that is not finite is never saved.
         check_finite(&self.parameters)?;
         self.save()?;
@@ -300,6 +306,9 @@ impl Finetuning {
             let phase = self.update(learning)?;
             self.state.updates += 1;
             let updates = self.state.updates;
+            if updates.is_multiple_of(self.settings.finetune.acting_weights_every) || updates == due {
+                self.updates.write_back(&self.parameters)?;
+            }
             let mut line = updates
                 .is_multiple_of(self.settings.metrics_every)
                 .then(|| learning.interval.end(updates, phase));
@@ -322,18 +331,9 @@ impl Finetuning {
         let Learning { batches, interval } = learning;
         let number = self.state.updates;
         let batch = interval.time(Spent::WaitingForBatches, || batches.next_batch())?;
-        let batch = batch.into_tensors(&self.device)?;
-        let mut sampler = Sampler::numbered(self.settings.seed, number);
         let warm_up = number < self.settings.finetune.warm_up_updates;
-        let (world, behaviour) = interval.time(Spent::Learning, || {
-            let world = self.world.update(&batch, &mut sampler)?;
-            if warm_up {
-                return Ok((world, None));
-            }
-            let start = world.posteriors.map(|x| x.flatten(0, 1))?; // [B*T, ...]
-            let behaviour = self.behaviour.update(&start, &mut sampler)?;
-            Ok::<_, TrainingError>((world, Some(behaviour)))
-        })?;
+        let (world, behaviour) = interval
+            .time(Spent::Learning, || self.updates.update(batch, (self.settings.seed, number), !warm_up))?;
         let mut values = json!({"losses": world.losses, "gradient_norm": world.gradient_norm});
         if let Some(behaviour) = behaviour {
             values["behaviour"] = json!(behaviour);
@@ -369,16 +369,16 @@ impl Finetuning {
 
     /// Saves a checkpoint; it is the best if the newest episodes had the highest success rate of all checkpoints, the first of equals.
     fn save(&mut self) -> Result<(), TrainingError> {
-        self.state.return_range = self.behaviour.return_range();
+        self.updates.write_back(&self.parameters)?;
+        self.state.return_range = self.updates.return_range();
         let full = self.newest.len() == self.settings.finetune.success_episodes;
         let success = self.success_rate().filter(|_| full);
         let is_best = success.is_some_and(|rate| self.state.best_success.is_none_or(|best| rate > best));
         if is_best {
             self.state.best_success = success;
         }
-        let [actor, critic] = self.behaviour.adams();
-        let [world_name, actor_name, critic_name] = OPTIMISERS;
-        let optimisers = [(world_name, self.world.adam()), (actor_name, actor), (critic_name, critic)];
+        let adams = self.updates.adams(&self.parameters)?;
+        let optimisers: Vec<_> = OPTIMISERS.into_iter().zip(&adams).collect();
         self.run.save(&self.parameters, &self.settings, &self.state, &optimisers, is_best.into())?;
         self.run.draw_curves(self.settings.finetune.warm_up_updates)?;
         let agent = Agent::new(&self.parameters.frozen(), &self.settings.model)?;

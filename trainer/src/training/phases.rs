@@ -163,6 +163,9 @@ pub struct FinetuneSettings {
     pub steps: u64,
     /// Steps that are replayed for every step that is made.
     pub train_ratio: f64,
+    /// Updates after which the policy acts with new weights, where updates are made on a GPU: acting stays on the CPU, and bringing
+    /// the weights there takes about as long as an update. On the CPU it always acts with the newest.
+    pub acting_weights_every: u64,
     /// Simulators at a time.
     pub simulators: usize,
     /// Decisions in an episode.
@@ -184,6 +187,7 @@ impl Default for FinetuneSettings {
             warm_up_updates: 500,
             steps: 500_000,
             train_ratio: 512.0,
+            acting_weights_every: 8,
             simulators: 2,
             episode_steps: 250,
             masks: false,
