@@ -17,6 +17,7 @@ use rcwm_trainer::learning::{HostBatch, Trained, WorldLearner, WorldSettings};
 use rcwm_trainer::model::agent;
 use rcwm_trainer::model::latent::Sampler;
 use rcwm_trainer::model::parameters::Parameters;
+use rcwm_trainer::parity::{self, Group};
 
 const SEED: u64 = 11;
 
@@ -66,7 +67,15 @@ fn plan<'a>(
     world: &'a WorldSettings,
     behaviour: Option<&'a BehaviourSettings>,
 ) -> GpuPlan<'a> {
-    GpuPlan { model, batch: (ROWS, LENGTH), world, behaviour, average_decay: 0.0, stored: (0, false) }
+    GpuPlan {
+        model,
+        batch: (ROWS, LENGTH),
+        world,
+        behaviour,
+        average_decay: 0.0,
+        stored: (0, false),
+        mode: false,
+    }
 }
 
 const ROWS: usize = 3;
@@ -189,6 +198,16 @@ fn programs_of_kernels_give_the_losses_gradients_and_weights_of_the_trainers_own
         for (masks, paint_every) in [(true, 1), (false, 3)] {
             compare(Machine::host(), Preset::Debug, kind, masks, paint_every, 1e-4);
         }
+    }
+}
+
+#[test]
+fn programs_give_the_authors_numbers() {
+    let file = std::path::Path::new(env!("CARGO_MANIFEST_DIR")).join("../tests/data/rcwm-small.safetensors");
+    let report = parity::check_programs(&file, &Group::ALL, Machine::host()).unwrap();
+    assert_eq!(report.groups.len(), 6);
+    for group in &report.groups {
+        assert!(group.passes(), "{}: {:?}", group.group.as_str(), group.worst());
     }
 }
 

@@ -236,6 +236,7 @@ fn make(case: &Case, ordinal: usize, precision: Precision, seed: u64) -> Result<
         behaviour: Some(&behaviour),
         average_decay: 0.0,
         stored: (count, false),
+        mode: false,
     };
     let mut learner = GpuLearner::new(machine, &plan, &parameters)?;
     learner.learner_mut().store(0, &host_batch(case.scale).image, &[])?;

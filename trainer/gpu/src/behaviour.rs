@@ -25,6 +25,8 @@ pub struct BehaviourScales {
     pub range_share: f32,
     /// Share of the critic that is mixed into its slow copy before each update.
     pub slow_share: f32,
+    /// Whether the actor's loss moves the critic too, against the definition: for comparisons.
+    pub actor_loss_reaches_critic: bool,
 }
 
 /// Means on the machine: actor's loss, critic's loss, entropy, reward, return, value.
@@ -104,12 +106,13 @@ pub fn losses(
     let entropy = rollout(tape, sources, sizes, length, (start, states), (control, word));
     tape.program.part("judge");
     let bins = bins(sources.frozen);
-    let value_of = |tape: &mut Tape, name: &str| {
-        let logits = tape.mlp(states, &sources.frozen.mlp(name), true);
+    let value_of = |tape: &mut Tape, source: Source<'_>, name: &str| {
+        let logits = tape.mlp(states, &source.mlp(name), true);
         two_hot_mean(tape, logits, bins)
     };
-    let reward = value_of(tape, "heads.reward");
-    let value = value_of(tape, "critic");
+    let reward = value_of(tape, sources.frozen, "heads.reward");
+    let judging = if scales.actor_loss_reaches_critic { sources.critic } else { sources.frozen };
+    let value = value_of(tape, judging, "critic");
     let discount = discount(tape, sources.frozen, states, scales.discount);
     let (returns, weights) = (tape.matrix(steps, 1), tape.matrix(length * n, 1));
     let p = [reward, value, discount, returns, weights].map(Pointer::from);
@@ -177,9 +180,12 @@ fn rollout(
     let entropy = tape.matrix(steps, 1);
     let actor = Stepping::new(tape, sources.actor.mlp("actor"), states.rows(0..steps));
     let mut next_noise = |tape: &mut Tape, cols: usize, normal: bool| {
+        if sizes.mode {
+            return None;
+        }
         let numbers = noise(tape, control, n, cols, normal, word);
         word += (n * cols * if normal { 2 } else { 1 }) as u64;
-        numbers
+        Some(numbers)
     };
     tape.copy(start, states.rows(0..n), false, 1.0);
     for step in 0..length - 1 {
@@ -201,7 +207,7 @@ fn rollout(
             rooms[branch].step(tape, layers, here.clone(), to(h));
             let logits = priors[branch].step(tape, to(h), here.clone());
             let gumbel = next_noise(tape, nm, false);
-            tape.draw(logits, Some(gumbel), to(z), draw);
+            tape.draw(logits, gumbel, to(z), draw);
         }
     }
     entropy
@@ -211,18 +217,18 @@ fn rollout(
 fn act(
     tape: &mut Tape,
     out: Matrix,
-    normal: Matrix,
+    normal: Option<Matrix>,
     action: Matrix,
     entropy: Matrix,
     (length, batch): (usize, usize),
 ) {
     let n = move |action: Matrix| [out.rows, action.cols, action.stride, length, batch];
-    let p = [out, normal, action, entropy].map(Pointer::from);
+    let p = [out.into(), normal.into(), action.into(), entropy.into()];
     tape.program.kernel(Kernel::ActorDraw, Grid::elements(out.rows), &p, &n(action), &[]);
     tape.on_backward(move |tape| {
         let (d_action, d_entropy) = (tape.gradient_of(action), tape.gradient_of(entropy));
         let d_out = tape.gradient_overwritten(out);
-        let p = [out, normal, d_action, d_entropy, d_out].map(Pointer::from);
+        let p = [out.into(), normal.into(), d_action.into(), d_entropy.into(), d_out.into()];
         tape.program.kernel(Kernel::ActorBackward, Grid::elements(out.rows), &p, &n(d_action), &[]);
     });
 }

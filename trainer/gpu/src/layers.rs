@@ -334,8 +334,8 @@ impl Tape {
     /// One-hot draws z [rows, n m] from logits [rows, n m], with a straight-through gradient. `noise` are Gumbel numbers (none: the mode); its
     /// row b * T + t belongs to row t * B + b where `major` is (T, B).
     pub fn draw(&mut self, logits: Matrix, noise: Option<Matrix>, z: Matrix, draw: Draw) {
-        let Draw { classes, unimix, major } = draw;
-        let (n, mode) = (logits.cols / classes, noise.is_none());
+        let Draw { classes, unimix, major, of_mode: mode } = draw;
+        let n = logits.cols / classes;
         let (t, b) = major.unwrap_or((0, 1));
         let grid = Grid::warps(logits.rows * n);
         let counts = [logits.rows, n, classes, logits.stride, z.stride, t, b];
@@ -563,6 +563,8 @@ pub struct Draw {
     pub unimix: f32,
     /// (T, B) where the noise's rows are those of sequences first.
     pub major: Option<(usize, usize)>,
+    /// Whether the gradient passes through log p, as that of the initial state's mode does, and not through p.
+    pub of_mode: bool,
 }
 
 /// Rows of the interaction: inputs, output, and what the weights' gradients need.

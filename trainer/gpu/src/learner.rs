@@ -395,6 +395,17 @@ impl Learner {
         Ok(features)
     }
 
+    /// The KL of the robot's branch (0) or the environment's (1) in the last batch, before it is clipped [T B], time-major.
+    ///
+    /// # Errors
+    /// [`GpuError::Failed`].
+    pub fn kl(&mut self, branch: usize) -> Result<Vec<f32>, GpuError> {
+        let rows = self.settings.sizes.rows();
+        let mut kl = vec![0.0; rows];
+        self.machine.download(self.room.inputs.kl + (4 * branch.min(1) * rows) as u64, &mut kl)?;
+        Ok(kl)
+    }
+
     fn count_step(&mut self, which: usize) {
         let group = self.optimisers[which].group;
         for (steps, entry) in self.steps.iter_mut().zip(self.weights.entries()) {
@@ -564,6 +575,7 @@ impl Room {
             first: words(rows)?,
             painted: words(rows)?,
             noise: words(10)?,
+            kl: words(2 * rows)?,
         };
         Ok(Self {
             inputs,

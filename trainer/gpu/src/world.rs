@@ -18,6 +18,8 @@ pub struct Sizes {
     pub length: usize,
     /// Of so many steps one is painted.
     pub paint_every: usize,
+    /// Whether draws are the most probable class and actions the mean, without noise: for comparisons.
+    pub mode: bool,
 }
 
 impl Sizes {
@@ -77,7 +79,7 @@ impl Sizes {
     /// Draws of this model's categoricals.
     #[must_use]
     pub fn draw(&self, major: Option<(usize, usize)>) -> Draw {
-        Draw { classes: self.model.classes, unimix: self.model.unimix as f32, major }
+        Draw { classes: self.model.classes, unimix: self.model.unimix as f32, major, of_mode: false }
     }
 }
 
@@ -123,6 +125,8 @@ pub struct Inputs {
     pub painted: u64,
     /// Key and stream of the noise, u32 [10].
     pub noise: u64,
+    /// Where each branch's KL goes, [2, T B].
+    pub kl: u64,
 }
 
 /// Losses on the machine, each a number: image, mask, reward, continue, and for each branch its KL and its KL raised to the free nats.
@@ -440,10 +444,10 @@ fn scan(
 ) -> Vec<(Matrix, Matrix)> {
     let (b, rows, nm) = (sizes.batch, sizes.rows(), sizes.z());
     let draws = sizes.draws();
-    let gumbel = noise(tape, inputs.noise, draws * rows, nm, false, 0);
+    let gumbel = (!sizes.mode).then(|| noise(tape, inputs.noise, draws * rows, nm, false, 0));
     let gumbel = move |t: usize, which: usize| {
         let from = (t * draws + which) * b;
-        Some(gumbel.rows(from..from + b))
+        gumbel.map(|gumbel| gumbel.rows(from..from + b))
     };
     let draw = sizes.draw(None);
     let branches: Vec<Branch> =
@@ -460,7 +464,7 @@ fn scan(
             let head = Head::prior(tape, branch, h);
             let logits = head.step(tape, h, 0..1);
             let z = tape.matrix(1, nm);
-            tape.draw(logits, None, z, draw);
+            tape.draw(logits, None, z, Draw { of_mode: true, ..draw });
             (z, h)
         })
         .collect();
@@ -623,7 +627,7 @@ fn other_losses(
 
     let m = sizes.model.classes;
     for (branch, (q, p)) in pairs.iter().enumerate() {
-        let kl = tape.matrix(1, rows);
+        let kl = Matrix::fixed(inputs.kl, 2, rows).rows(branch..branch + 1);
         let (dq, dp) = (tape.gradient_overwritten(*q), tape.gradient_overwritten(*p));
         let pointers = [*q, *p, kl, dq, dp].map(Pointer::from);
         let n = [rows, q.cols / m, m, q.stride, p.stride, dq.stride, dp.stride];

@@ -3,22 +3,27 @@ use std::process::ExitCode;
 
 use anyhow::Result;
 use rcwm_trainer::parity::{self, Group, Measure, Report};
+use rcwm_trainer::training::Compute;
 use serde::Serialize;
 
 /// Compare our model with a reference file of the authors' implementation; exit 1 beyond tolerance
 #[derive(Debug, clap::Args)]
 #[command(after_help = "Examples:
   rcwm-trainer parity tests/data/rcwm-small.safetensors
-  rcwm-trainer parity tests/data/rcwm-small.safetensors --group observe --json parity.json")]
+  rcwm-trainer parity tests/data/rcwm-small.safetensors --group observe --json parity.json
+  rcwm-trainer parity tests/data/rcwm-small.safetensors --device cuda
+
+On a GPU the groups of updates are compared (loss, gradients, what Adam makes of them), which depend
+on everything before them. The tolerances are those of f32; other precisions fail them and show by
+how much.")]
 pub struct Parity {
     /// The reference file
     file: PathBuf,
     /// Compare this group only (repeatable); all by default
     #[arg(long = "group", value_enum, value_name = "NAME")]
     groups: Vec<Group>,
-    /// Where to compute: cpu, cuda or cuda:N
-    #[arg(long, default_value = "cpu")]
-    device: String,
+    #[command(flatten)]
+    compute: super::ComputeArguments,
     /// Write every tensor's error as JSON
     #[arg(long, value_name = "FILE")]
     json: Option<PathBuf>,
@@ -35,7 +40,13 @@ struct Outcome<'a> {
 impl Parity {
     pub fn run(self) -> Result<ExitCode> {
         let groups = if self.groups.is_empty() { Group::ALL.to_vec() } else { self.groups.clone() };
-        let report = parity::check_file(&self.file, &groups, &super::parse_device(&self.device)?)?;
+        let report = match self.compute.compute()? {
+            Compute::Tensors(device) => parity::check_file(&self.file, &groups, &device)?,
+            Compute::Programs(machine) => {
+                println!("updates by programs of kernels on {}", machine.name());
+                parity::check_programs(&self.file, &groups, machine)?
+            }
+        };
         print(&report);
         if let Some(path) = &self.json {
             super::write_json(path, &Outcome { file: &self.file, passes: report.passes(), report: &report })?;

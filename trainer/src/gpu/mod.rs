@@ -11,7 +11,7 @@ use rand_chacha::ChaCha8Rng;
 use rcwm_gpu::learner::{AdamScales, Images, Noise};
 use rcwm_gpu::weights::{Array, Group};
 use rcwm_gpu::world::{Sizes, WorldScales};
-use rcwm_gpu::{BehaviourValues, GpuError, Learner, LearnerSettings, Machine, WorldValues};
+use rcwm_gpu::{BehaviourValues, Learner, LearnerSettings, Machine, WorldValues};
 use rcwm_models::episode::Episode;
 use rcwm_models::settings::{ModelKind, ModelSettings};
 
@@ -38,6 +38,8 @@ pub struct GpuPlan<'a> {
     pub average_decay: f64,
     /// Images kept on the GPU, and whether their masks are; 0: every batch brings its own.
     pub stored: (usize, bool),
+    /// Whether draws are the most probable class and actions the mean: for comparisons.
+    pub mode: bool,
 }
 
 /// World model, actor and critic on a GPU.
@@ -76,15 +78,12 @@ impl GpuLearner {
     /// [`LearningError`], also where the settings ask for what updates on a GPU do not do.
     pub fn new(machine: Machine, plan: &GpuPlan<'_>, parameters: &Parameters) -> Result<Self, LearningError> {
         let GpuPlan { model, world, behaviour, .. } = plan;
-        if behaviour.is_some_and(|behaviour| behaviour.actor_loss_reaches_critic) {
-            let text = "behaviour.actor_loss_reaches_critic is not done on a GPU; set it to false".to_owned();
-            return Err(GpuError::Unsupported(text).into());
-        }
         let sizes = Sizes {
             model: (*model).clone(),
             batch: plan.batch.0,
             length: plan.batch.1,
             paint_every: world.paint_every,
+            mode: plan.mode,
         };
         let scales = WorldScales {
             image: world.image_scale as f32,
@@ -306,6 +305,7 @@ fn behaviour_scales(settings: &BehaviourSettings) -> rcwm_gpu::behaviour::Behavi
         quantiles: [settings.return_range_low as f32, settings.return_range_high as f32],
         range_share: settings.return_range_share as f32,
         slow_share: settings.slow_critic_share as f32,
+        actor_loss_reaches_critic: settings.actor_loss_reaches_critic,
     }
 }
 

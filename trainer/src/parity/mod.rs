@@ -5,6 +5,7 @@
 
 mod forward;
 mod group;
+mod programs;
 mod reference;
 mod report;
 mod updates;
@@ -12,6 +13,7 @@ mod updates;
 use std::path::Path;
 
 use candle_core::Device;
+use rcwm_gpu::Machine;
 
 pub use group::{Group, Measure};
 pub use reference::{Reference, ReferenceError};
@@ -45,6 +47,20 @@ pub fn check_file(path: &Path, groups: &[Group], device: &Device) -> Result<Repo
     check(&Reference::read(path)?, groups, device)
 }
 
+/// Compares a reference file with the updates that programs make on `machine`: the groups from [`Group::Loss`] on.
+///
+/// # Errors
+/// See [`ParityError`]; a difference is no error but part of the report.
+pub fn check_programs(path: &Path, groups: &[Group], machine: Machine) -> Result<Report, ParityError> {
+    let reference = Reference::read(path)?;
+    let made = programs::Programs::new(&reference, machine)?;
+    let mut reports = Vec::new();
+    for group in groups.iter().filter(|group| **group > Group::Behaviour) {
+        reports.push(compare(&reference, *group, made.compute(*group)?)?);
+    }
+    Ok(Report::new(&reference, reports))
+}
+
 /// Compares a reference with our model, group by group.
 ///
 /// # Errors
@@ -61,11 +77,19 @@ pub fn check(reference: &Reference, groups: &[Group], device: &Device) -> Result
             let made = updates.take().map_or_else(|| updates::Updates::new(reference, device), Ok)?;
             updates.insert(made).compute(*group)?
         };
-        let (measure, tolerance) = group.tolerance();
-        let compare =
-            |(name, found): (String, candle_core::Tensor)| Comparison::new(reference, &name, &found, measure);
-        let comparisons = found.into_iter().map(compare).collect::<Result<_, ParityError>>()?;
-        reports.push(GroupReport { group: *group, measure, tolerance, comparisons });
+        reports.push(compare(reference, *group, found)?);
     }
     Ok(Report::new(reference, reports))
+}
+
+fn compare(
+    reference: &Reference,
+    group: Group,
+    found: Vec<(String, candle_core::Tensor)>,
+) -> Result<GroupReport, ParityError> {
+    let (measure, tolerance) = group.tolerance();
+    let compare =
+        |(name, found): (String, candle_core::Tensor)| Comparison::new(reference, &name, &found, measure);
+    let comparisons = found.into_iter().map(compare).collect::<Result<_, ParityError>>()?;
+    Ok(GroupReport { group, measure, tolerance, comparisons })
 }

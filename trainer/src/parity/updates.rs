@@ -103,15 +103,23 @@ impl Updates {
 /// Our gradients, but the file's where an entry is smaller than the error that f32 excuses: Adam's first step is nearly the
 /// sign of the gradient, and of such an entry not even the sign is known.
 fn resolved(reference: &Reference, ours: &Gradients, device: &Device) -> Result<Gradients, ParityError> {
-    let (_, tolerance) = Group::Grad.tolerance();
     let mut tensors = BTreeMap::new();
     for (name, ours) in ours.iter() {
-        let key = format!("grad/{name}");
-        let theirs = reference.tensor(&key, device)?;
-        let unresolved = theirs.abs()?.lt(f64::from(tolerance * reference.unit(&key)?))?;
-        tensors.insert(name.to_owned(), unresolved.where_cond(&theirs, ours)?);
+        let theirs = reference.tensor(&format!("grad/{name}"), device)?;
+        tensors.insert(
+            name.to_owned(),
+            unresolved(reference, name)?.to_device(device)?.where_cond(&theirs, ours)?,
+        );
     }
     Ok(Gradients::new(tensors)?)
+}
+
+/// 1 where an entry of the file's gradient is smaller than the error that f32 excuses.
+pub(super) fn unresolved(reference: &Reference, name: &str) -> Result<Tensor, ParityError> {
+    let (_, tolerance) = Group::Grad.tolerance();
+    let key = format!("grad/{name}");
+    let theirs = reference.tensor(&key, &Device::Cpu)?;
+    Ok(theirs.abs()?.lt(f64::from(tolerance * reference.unit(&key)?))?)
 }
 
 fn scalar(value: f64) -> Result<Tensor, candle_core::Error> {

@@ -115,6 +115,7 @@ impl WorldUpdates {
             behaviour: None,
             average_decay: settings.average_decay,
             stored: (steps.max(1) as usize, masks),
+            mode: false,
         };
         let mut learner = GpuLearner::new(machine, &plan, parameters)?;
         learner.load(Array::Average, &run.kept(parameters))?;
@@ -205,6 +206,7 @@ impl AgentUpdates {
                     behaviour: Some(behaviour),
                     average_decay: 0.0,
                     stored: (0, false),
+                    mode: false,
                 };
                 let learner = Box::new(GpuLearner::new(machine, &plan, parameters)?);
                 Self::Programs { learner, range: ReturnRange::default() }
@@ -292,10 +294,5 @@ impl AgentUpdates {
             Self::Tensors { behaviour, .. } => behaviour.return_range(),
             Self::Programs { range, .. } => *range,
         }
-    }
-
-    /// Whether the trainer's parameters are what is trained, and so never older than it.
-    pub fn shares_parameters(&self) -> bool {
-        matches!(self, Self::Tensors { .. })
     }
 }
