@@ -1,8 +1,10 @@
-use std::path::PathBuf;
+use std::path::{Path, PathBuf};
 use std::process::ExitCode;
+use std::sync::atomic::Ordering;
+use std::time::{Duration, Instant};
 
 use anyhow::Result;
-use indicatif::{ProgressBar, ProgressStyle};
+use indicatif::{MultiProgress, ProgressBar, ProgressStyle};
 use rcwm_models::settings;
 use rcwm_trainer::replay::{Folder, Replay};
 use rcwm_trainer::training::{
@@ -20,6 +22,8 @@ use super::bars::{self, absolute};
   rcwm-trainer pretrain --out runs/small --resume --set pretrain.updates=40000
   rcwm-trainer pretrain --preset paper --data data/upstream --out runs/paper --device cuda \\
       --precision tf32
+  rcwm-trainer pretrain --preset small --data data/upstream --out runs/five --seeds 0,1,2,3,4 \\
+      --device cuda
 
 Every setting and its value is in settings.toml of the run's folder; curves.png there and
 TensorBoard (tensorboard --logdir runs) show how it goes. replay.held_out_episodes of each task
@@ -42,6 +46,10 @@ pub struct Pretrain {
     /// Folder of the run
     #[arg(long, value_name = "DIR")]
     out: PathBuf,
+    /// Several runs of these seeds at once, each in a folder of --out: seed-0, seed-1, ... On a GPU they share the
+    /// card, which one run of a small model leaves mostly idle
+    #[arg(long, value_name = "N", value_delimiter = ',')]
+    seeds: Vec<u64>,
     /// Change one setting, for example --set replay.batch=4 (repeatable)
     #[arg(long = "set", value_name = "KEY=VALUE")]
     overrides: Vec<String>,
@@ -54,35 +62,78 @@ pub struct Pretrain {
 
 impl Pretrain {
     pub fn run(self) -> Result<ExitCode> {
-        let compute = self.compute.compute()?;
-        let stop = super::stop_on_ctrl_c()?;
-        let settings = self.settings()?;
-        settings.validate()?;
-        if !self.resume && self.out.join("settings.toml").exists() {
-            return Err(TrainingError::Exists { path: self.out }.into());
-        }
-        let replay = load(&settings)?;
-        let mut training = if self.resume {
-            Pretraining::resume(&self.out, settings.clone(), compute)?
+        let outs: Vec<(PathBuf, Option<u64>)> = if self.seeds.is_empty() {
+            vec![(self.out.clone(), None)]
         } else {
-            Pretraining::create(&self.out, settings.clone(), compute)?
+            self.seeds.iter().map(|seed| (self.out.join(format!("seed-{seed}")), Some(*seed))).collect()
         };
-        let bar = bars::updates(settings.pretrain.updates, training.updates());
-        let outcome = training.run(replay, &stop, |progress| show(&bar, progress))?;
-        bar.finish_and_clear();
-        let out = self.out.display();
-        if outcome.interrupted {
-            println!("stopped and saved after {} updates; go on with --resume --out {out}", outcome.updates);
-        } else {
-            println!("{} updates; checkpoint in {}", outcome.updates, Run::last(&self.out).display());
+        let stop = super::stop_on_ctrl_c()?;
+        let mut settings = Vec::with_capacity(outs.len());
+        for (out, seed) in &outs {
+            if !self.resume && out.join("settings.toml").exists() {
+                return Err(TrainingError::Exists { path: out.clone() }.into());
+            }
+            let mut resolved = self.settings(out)?;
+            resolved.seed = seed.unwrap_or(resolved.seed);
+            resolved.validate()?;
+            settings.push(resolved);
+        }
+        let Some(first) = settings.first() else { anyhow::bail!("--seeds: expected at least one") };
+        let replay = load(first)?;
+        let mut runs = Vec::with_capacity(outs.len());
+        for ((out, _), settings) in outs.iter().zip(settings) {
+            let compute = self.compute.compute()?;
+            let training = if self.resume {
+                Pretraining::resume(out, settings.clone(), compute)?
+            } else {
+                Pretraining::create(out, settings.clone(), compute)?
+            };
+            runs.push((out, training, bars::updates(settings.pretrain.updates, 0)));
+        }
+        let bars = MultiProgress::new();
+        let outcomes = std::thread::scope(|scope| {
+            let threads: Vec<_> = runs
+                .into_iter()
+                .map(|(out, mut training, bar)| {
+                    let (bar, replay, stop) = (bars.add(bar), replay.clone(), &*stop);
+                    bar.set_position(training.updates());
+                    bar.reset_eta();
+                    scope.spawn(move || {
+                        let mut shown = Instant::now();
+                        let outcome = training.run(replay, stop, |progress| show(&bar, &mut shown, progress));
+                        // Whatever ends one run ends the others where they are, with a checkpoint each.
+                        if outcome.is_err() {
+                            stop.store(true, Ordering::Relaxed);
+                        }
+                        bar.finish_and_clear();
+                        (out, outcome)
+                    })
+                })
+                .collect();
+            threads
+                .into_iter()
+                .map(|thread| thread.join().map_err(|_| anyhow::anyhow!("a run's thread panicked")))
+                .collect::<Result<Vec<_>>>()
+        })?;
+        for (out, outcome) in outcomes {
+            let (outcome, out) = (outcome?, out.as_path());
+            if outcome.interrupted {
+                println!(
+                    "stopped and saved after {} updates; go on with --resume --out {}",
+                    outcome.updates,
+                    self.out.display()
+                );
+            } else {
+                println!("{} updates; checkpoint in {}", outcome.updates, Run::last(out).display());
+            }
         }
         Ok(ExitCode::SUCCESS)
     }
 
     /// The settings of a new run, or those of the run to be resumed; with the overrides.
-    fn settings(&self) -> Result<TrainingSettings> {
+    fn settings(&self, out: &Path) -> Result<TrainingSettings> {
         let mut settings = if self.resume {
-            Run::settings(&self.out)?
+            Run::settings(out)?
         } else {
             let data = self.data.clone().unwrap_or_default();
             TrainingSettings::preset(self.preset.preset(), self.model.kind(), absolute(&data)?)
@@ -120,8 +171,16 @@ fn load(settings: &TrainingSettings) -> Result<Replay> {
     Ok(replay)
 }
 
-fn show(bar: &ProgressBar, progress: &Progress<'_>) {
+/// Without a terminal, time between two lines.
+const LINE_EVERY: Duration = Duration::from_secs(10);
+
+fn show(bar: &ProgressBar, shown: &mut Instant, progress: &Progress<'_>) {
     bar.set_position(progress.updates);
+    if let (true, Some(metrics), true) = (bar.is_hidden(), progress.metrics, shown.elapsed() >= LINE_EVERY) {
+        *shown = Instant::now();
+        let (done, all) = (progress.updates, bar.length().unwrap_or_default());
+        println!("{done} of {all} updates, ETA {:.0?}  {}", bar.eta(), describe(metrics));
+    }
     if let Some(HeldOutLosses { update, held_out, best }) = progress.held_out {
         let best = if *best { ", the best so far" } else { "" };
         bar.println(format!(
