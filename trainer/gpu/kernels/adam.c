@@ -3,9 +3,9 @@
 // Sums of squares over runs of n[1] numbers, one a block: partial [blocks]. p: x, partial. n: count, run.
 KERNEL(squares) {
     const float *x = (const float *)a.p[0];
-    long from = BLOCK * a.n[1], to = from + a.n[1] < a.n[0] ? from + a.n[1] : a.n[0];
+    int from = BLOCK * a.n[1], to = from + a.n[1] < a.n[0] ? from + a.n[1] : a.n[0];
     float sum = 0.0f;
-    for (long i = from + THREAD; i < to; i += THREADS) sum += x[i] * x[i];
+    for (int i = from + THREAD; i < to; i += THREADS) sum += x[i] * x[i];
     sum = block_sum(sum);
     if (THREAD == 0) ((float *)a.p[1])[BLOCK] = sum;
 }
@@ -16,9 +16,9 @@ KERNEL(clip) {
     const float *partial = (const float *)a.p[0], *scalars = (const float *)a.p[1];
     float *out = (float *)a.p[2];
     float sum = 0.0f;
-    for (long i = THREAD; i < a.n[0]; i += THREADS) sum += partial[i];
+    for (int i = THREAD; i < a.n[0]; i += THREADS) sum += partial[i];
     float norm = sqrtf(block_sum(sum)), finite = norm - norm;
-    for (long i = 0; i < a.n[1]; i++) finite += scalars[i] - scalars[i];
+    for (int i = 0; i < a.n[1]; i++) finite += scalars[i] - scalars[i];
     if (THREAD == 0) {
         out[0] = norm;
         out[1] = finite == 0.0f ? fminf(1.0f, a.f[0] / (norm + 1e-6f)) : 0.0f;

@@ -5,12 +5,12 @@ typedef struct {
     float largest, sum;
 } Softmax;
 
-DEVICE Softmax softmax_of(const float *x, long classes, int lane, int lanes) {
+DEVICE Softmax softmax_of(const float *x, int classes, int lane, int lanes) {
     Softmax s;
     float largest = x[lane < classes ? lane : 0], sum = 0.0f;
-    for (long j = lane; j < classes; j += lanes) largest = fmaxf(largest, x[j]);
+    for (int j = lane; j < classes; j += lanes) largest = fmaxf(largest, x[j]);
     s.largest = warp_max(largest);
-    for (long j = lane; j < classes; j += lanes) sum += expf(x[j] - s.largest);
+    for (int j = lane; j < classes; j += lanes) sum += expf(x[j] - s.largest);
     s.sum = warp_sum(sum);
     return s;
 }
@@ -20,17 +20,17 @@ DEVICE Softmax softmax_of(const float *x, long classes, int lane, int lanes) {
 KERNEL(draw) {
     const float *logits = (const float *)a.p[0], *gumbel = (const float *)a.p[1];
     float *z = (float *)a.p[2];
-    long n = a.n[1], m = a.n[2];
+    int n = a.n[1], m = a.n[2];
     Team t = team(0);
-    for (long g = t.first; g < a.n[0] * n; g += t.step) {
-        long row = g / n, at = g % n * m;
+    for (int g = t.first; g < a.n[0] * n; g += t.step) {
+        int row = g / n, at = g % n * m;
         const float *x = logits + row * a.n[3] + at;
-        long from = a.n[5] > 0 ? row % a.n[6] * a.n[5] + row / a.n[6] : row;
+        int from = a.n[5] > 0 ? row % a.n[6] * a.n[5] + row / a.n[6] : row;
         const float *noise = gumbel ? gumbel + from * n * m + at : 0;
         Softmax s = softmax_of(x, m, t.lane, t.lanes);
         float best = -INFINITY;
         int index = 0x7fffffff;
-        for (long j = t.lane; j < m; j += t.lanes) {
+        for (int j = t.lane; j < m; j += t.lanes) {
             float p = (1.0f - a.f[0]) * (expf(x[j] - s.largest) / s.sum) + a.f[0] / (float)m;
             float score = noise ? logf(p) + noise[j] : p;
             if (score > best) {
@@ -39,7 +39,7 @@ KERNEL(draw) {
             }
         }
         index = warp_best(best, index);
-        for (long j = t.lane; j < m; j += t.lanes) z[row * a.n[4] + at + j] = j == index ? 1.0f : 0.0f;
+        for (int j = t.lane; j < m; j += t.lanes) z[row * a.n[4] + at + j] = j == index ? 1.0f : 0.0f;
     }
 }
 
@@ -48,19 +48,19 @@ KERNEL(draw) {
 KERNEL(draw_backward) {
     const float *logits = (const float *)a.p[0], *dz = (const float *)a.p[1];
     float *dx = (float *)a.p[2];
-    long n = a.n[1], m = a.n[2];
+    int n = a.n[1], m = a.n[2];
     Team t = team(0);
-    for (long g = t.first; g < a.n[0] * n; g += t.step) {
-        long row = g / n, at = g % n * m;
+    for (int g = t.first; g < a.n[0] * n; g += t.step) {
+        int row = g / n, at = g % n * m;
         const float *x = logits + row * a.n[3] + at, *d = dz + row * a.n[4] + at;
         Softmax s = softmax_of(x, m, t.lane, t.lanes);
         float sum = 0.0f;
-        for (long j = t.lane; j < m; j += t.lanes) {
+        for (int j = t.lane; j < m; j += t.lanes) {
             float y = expf(x[j] - s.largest) / s.sum, p = (1.0f - a.f[0]) * y + a.f[0] / (float)m;
             sum += y * (a.n[6] ? d[j] / p : d[j]);
         }
         sum = warp_sum(sum);
-        for (long j = t.lane; j < m; j += t.lanes) {
+        for (int j = t.lane; j < m; j += t.lanes) {
             float y = expf(x[j] - s.largest) / s.sum, p = (1.0f - a.f[0]) * y + a.f[0] / (float)m;
             put(dx + row * a.n[5] + at + j, a.n[7], (1.0f - a.f[0]) * y * ((a.n[6] ? d[j] / p : d[j]) - sum));
         }
@@ -74,18 +74,18 @@ KERNEL(draw_backward) {
 KERNEL(balanced_kl) {
     const float *q = (const float *)a.p[0], *p = (const float *)a.p[1];
     float *kl = (float *)a.p[2], *dq = (float *)a.p[3], *dp = (float *)a.p[4];
-    long n = a.n[1], m = a.n[2];
+    int n = a.n[1], m = a.n[2];
     float share = 1.0f - a.f[0], mixed = a.f[0] / (float)m;
     Team t = team(0);
-    for (long r = t.first; r < a.n[0]; r += t.step) {
+    for (int r = t.first; r < a.n[0]; r += t.step) {
         float total = 0.0f;
-        for (long pass = 0; pass < 2; pass++) {
+        for (int pass = 0; pass < 2; pass++) {
             float counts = total >= a.f[1] ? 1.0f : 0.0f, found = 0.0f;
-            for (long g = 0; g < n; g++) {
+            for (int g = 0; g < n; g++) {
                 const float *x = q + r * a.n[3] + g * m, *y = p + r * a.n[4] + g * m;
                 Softmax sq = softmax_of(x, m, t.lane, t.lanes), sp = softmax_of(y, m, t.lane, t.lanes);
                 float mean_q = 0.0f, mean_p = 0.0f;
-                for (long j = t.lane; j < m; j += t.lanes) {
+                for (int j = t.lane; j < m; j += t.lanes) {
                     float eq = expf(x[j] - sq.largest) / sq.sum, ep = expf(y[j] - sp.largest) / sp.sum;
                     float cq = share * eq + mixed, cp = share * ep + mixed, ratio = logf(cq) - logf(cp);
                     if (pass == 0) found += cq * ratio;
@@ -95,7 +95,7 @@ KERNEL(balanced_kl) {
                 if (pass == 0) continue;
                 mean_q = warp_sum(mean_q);
                 mean_p = warp_sum(mean_p);
-                for (long j = t.lane; j < m; j += t.lanes) {
+                for (int j = t.lane; j < m; j += t.lanes) {
                     float eq = expf(x[j] - sq.largest) / sq.sum, ep = expf(y[j] - sp.largest) / sp.sum;
                     float cq = share * eq + mixed, cp = share * ep + mixed, ratio = logf(cq) - logf(cp);
                     dq[r * a.n[5] + g * m + j] = counts * a.f[3] * share * eq * (ratio + 1.0f - mean_q);

@@ -5,10 +5,11 @@
 #ifndef RCWM_COMMON_H
 #define RCWM_COMMON_H
 
-// Arguments of every kernel: addresses, counts and factors, in the order that the kernel's comment names.
+// Arguments of every kernel: addresses, counts and factors, in the order that the kernel's comment names. Counts are 32 bits wide, which GPUs
+// divide by quickly; no buffer holds 2^31 numbers.
 typedef struct {
     void *p[16];
-    long n[16];
+    int n[16];
     float f[8];
 } Args;
 
@@ -16,10 +17,12 @@ typedef unsigned int u32;
 typedef unsigned char u8;
 
 #ifdef __CUDACC__
-#define KERNEL(name) extern "C" __global__ void name(Args a)
+// A kernel is a function of its own, and one that others call with blocks of their choice.
+#define KERNEL(name)                                                                                          \
+    DEVICE void name##_in(const Args &a, int BLOCK, int BLOCKS);                                              \
+    extern "C" __global__ void name(const __grid_constant__ Args a) { name##_in(a, (int)blockIdx.x, (int)gridDim.x); } \
+    DEVICE void name##_in(const Args &a, int BLOCK, int BLOCKS)
 #define DEVICE static __device__ __forceinline__
-#define BLOCK ((long)blockIdx.x)
-#define BLOCKS ((long)gridDim.x)
 #define THREAD ((int)threadIdx.x)
 #define THREADS ((int)blockDim.x)
 #define LANES 32
@@ -29,7 +32,7 @@ typedef unsigned char u8;
 #define INFINITY __int_as_float(0x7f800000)
 #else
 #include <math.h>
-#define KERNEL(name) void name(Args a, long BLOCK, long BLOCKS)
+#define KERNEL(name) void name(Args a, int BLOCK, int BLOCKS)
 #define DEVICE static inline
 #define THREAD 0
 #define THREADS 1
@@ -51,18 +54,19 @@ typedef struct {
 #define LANE (THREAD % LANES)
 #define WARP (THREAD / LANES)
 #define WARPS (THREADS / LANES)
-#define FOR_ALL(i, count) for (long i = BLOCK * THREADS + THREAD; i < (count); i += BLOCKS * THREADS)
+#define FOR_ALL(i, count) for (u32 i = (u32)(BLOCK * THREADS + THREAD); i < (u32)(count); i += (u32)(BLOCKS * THREADS))
 
 typedef struct {
-    long first, step;  // rows of this team
+    int first, step;  // rows of this team
     int lane, lanes;   // this thread in it
     int wide;
 } Team;
 
 #ifdef __CUDACC__
-DEVICE Team team(long wide) {
+#define team(wide) team_of(wide, BLOCK, BLOCKS)
+DEVICE Team team_of(int wide, int BLOCK, int BLOCKS) {
     Team t;
-    t.wide = (int)wide;
+    t.wide = wide;
     t.first = wide ? BLOCK : BLOCK * WARPS + WARP;
     t.step = wide ? BLOCKS : BLOCKS * WARPS;
     t.lane = wide ? THREAD : LANE;
@@ -117,7 +121,7 @@ DEVICE float across_warps(float x) {
     return sum;
 }
 #else
-static inline Team team_of(long BLOCK, long BLOCKS) {
+static inline Team team_of(int BLOCK, int BLOCKS) {
     Team t = {BLOCK, BLOCKS, 0, 1, 0};
     return t;
 }
@@ -135,6 +139,6 @@ DEVICE float symlog_of(float x) { return x < 0.0f ? -log1pf(-x) : log1pf(x); }
 DEVICE float symexp_of(float x) { return x < 0.0f ? -expm1f(-x) : expm1f(x); }
 
 // What an output becomes: `found`, added to what is there where `add` says so.
-DEVICE void put(float *at, long add, float found) { *at = add ? *at + found : found; }
+DEVICE void put(float *at, int add, float found) { *at = add ? *at + found : found; }
 
 #endif

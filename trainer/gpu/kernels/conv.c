@@ -11,12 +11,12 @@ KERNEL(windows) {
         Four *y = (Four *)a.p[1];
         u32 side = (u32)a.n[1], half = side / 2, fours = channels / 4, width = 16 * fours;
         u32 at_once = THREADS > (int)width ? (u32)THREADS / width : 1;
-        for (long group = BLOCK; group * at_once < a.n[0] * half * half; group += BLOCKS) {
+        for (int group = BLOCK; (u32)group * at_once < (u32)a.n[0] * half * half; group += BLOCKS) {
             u32 place = (u32)group * at_once + (u32)THREAD / width, top, left;
             if (place >= a.n[0] * half * half || (u32)THREAD / width >= at_once) continue;
             top = 2 * (place / half % half);
             left = 2 * (place % half);
-            long image = (long)(place / (half * half)) * side;
+            int image = (int)(place / (half * half) * side);
             for (u32 k = (u32)THREAD % width; k < width; k += (u32)THREADS) {
                 u32 tap = k / fours, row = top + tap / 4, column = left + tap % 4;
                 Four value = {0.0f, 0.0f, 0.0f, 0.0f};
@@ -106,10 +106,10 @@ KERNEL(picture_loss) {
     const u8 *mask = (const u8 *)a.p[3];
     const u32 *rows = (const u32 *)a.p[4];
     float *d[2] = {(float *)a.p[7], (float *)a.p[8]};
-    for (long at = BLOCK; at < a.n[0]; at += BLOCKS) {
-        long source = (rows ? (long)rows[at] : at) * 4096;
+    for (int at = BLOCK; at < a.n[0]; at += BLOCKS) {
+        int source = (rows ? (int)rows[at] : at) * 4096;
         float loss = 0.0f, mask_loss = 0.0f;
-        for (long i = THREAD; i < 4096; i += THREADS) {
+        for (int i = THREAD; i < 4096; i += THREADS) {
             const float *x = raw[0] + 4 * (at * 4096 + i), *truth = image + 3 * (source + i);
             float *dx = d[0] + 4 * (at * 4096 + i), alpha = sigmoid_of(x[3]), d_alpha = 0.0f;
             if (raw[1]) {

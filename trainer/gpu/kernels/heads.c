@@ -5,12 +5,12 @@ typedef struct {
     float largest, sum;
 } Row;
 
-DEVICE Row row_of(const float *x, long width, int lane, int lanes) {
+DEVICE Row row_of(const float *x, int width, int lane, int lanes) {
     Row s;
     float largest = -INFINITY, sum = 0.0f;
-    for (long j = lane; j < width; j += lanes) largest = fmaxf(largest, x[j]);
+    for (int j = lane; j < width; j += lanes) largest = fmaxf(largest, x[j]);
     s.largest = warp_max(largest);
-    for (long j = lane; j < width; j += lanes) sum += expf(x[j] - s.largest);
+    for (int j = lane; j < width; j += lanes) sum += expf(x[j] - s.largest);
     s.sum = warp_sum(sum);
     return s;
 }
@@ -22,15 +22,15 @@ KERNEL(two_hot_loss) {
     const float *logits = (const float *)a.p[0], *values = (const float *)a.p[1], *weights = (const float *)a.p[2];
     const float *bins = (const float *)a.p[3];
     float *loss = (float *)a.p[4], *dx = (float *)a.p[5];
-    long width = a.n[1];
+    int width = a.n[1];
     float spacing = bins[1] - bins[0];
     Team t = team(0);
-    for (long r = t.first; r < a.n[0]; r += t.step) {
+    for (int r = t.first; r < a.n[0]; r += t.step) {
         const float *x = logits + r * width;
         float target = fminf(fmaxf(symlog_of(values[r * a.n[2]]), bins[0]), bins[width - 1]), weight = weights ? weights[r] : 1.0f;
         Row s = row_of(x, width, t.lane, t.lanes);
         float log_sum = logf(s.sum) + s.largest, found = 0.0f;
-        for (long j = t.lane; j < width; j += t.lanes) {
+        for (int j = t.lane; j < width; j += t.lanes) {
             float hot = fmaxf(0.0f, 1.0f - fabsf(target - bins[j]) / spacing);
             found += hot * (log_sum - x[j]);
             put(dx + r * width + j, a.n[3], a.f[0] * weight * (expf(x[j] - s.largest) / s.sum - hot));
@@ -45,20 +45,20 @@ KERNEL(two_hot_loss) {
 KERNEL(two_hot_mean) {
     const float *logits = (const float *)a.p[0], *bins = (const float *)a.p[1], *d_value = (const float *)a.p[3];
     float *value = (float *)a.p[2], *dx = (float *)a.p[4];
-    long width = a.n[1], half = width / 2;
+    int width = a.n[1], half = width / 2;
     Team t = team(0);
-    for (long r = t.first; r < a.n[0]; r += t.step) {
+    for (int r = t.first; r < a.n[0]; r += t.step) {
         const float *x = logits + r * width;
         Row s = row_of(x, width, t.lane, t.lanes);
         float mean = 0.0f;
-        for (long j = t.lane; j < half; j += t.lanes) {
+        for (int j = t.lane; j < half; j += t.lanes) {
             float above = expf(x[half + 1 + j] - s.largest), below = expf(x[half - 1 - j] - s.largest);
             mean += (above - below) / s.sum * bins[half + 1 + j];
         }
         mean = warp_sum(mean);
         if (a.n[2]) {
             float d = d_value[r] * expf(fabsf(mean));
-            for (long j = t.lane; j < width; j += t.lanes)
+            for (int j = t.lane; j < width; j += t.lanes)
                 dx[r * width + j] = d * expf(x[j] - s.largest) / s.sum * (bins[j] - mean);
         } else if (t.lane == 0) {
             value[r] = symexp_of(mean);
@@ -95,8 +95,8 @@ KERNEL(actor_draw) {
     const float *out = (const float *)a.p[0], *noise = (const float *)a.p[1];
     FOR_ALL(r, a.n[0]) {
         float entropy = 0.0f;
-        long from = a.n[3] > 0 ? r % a.n[4] * a.n[3] + r / a.n[4] : r;
-        for (long j = 0; j < a.n[1]; j++) {
+        int from = a.n[3] > 0 ? r % a.n[4] * a.n[3] + r / a.n[4] : r;
+        for (int j = 0; j < a.n[1]; j++) {
             float mean = tanhf(out[2 * r * a.n[1] + j]);
             float std = 0.9f * sigmoid_of(out[(2 * r + 1) * a.n[1] + j] + 2.0f) + 0.1f;
             float action = noise ? mean + std * noise[from * a.n[1] + j] : mean;
@@ -113,8 +113,8 @@ KERNEL(actor_backward) {
     const float *d_entropy = (const float *)a.p[3];
     float *dx = (float *)a.p[4];
     FOR_ALL(r, a.n[0]) {
-        long from = a.n[3] > 0 ? r % a.n[4] * a.n[3] + r / a.n[4] : r;
-        for (long j = 0; j < a.n[1]; j++) {
+        int from = a.n[3] > 0 ? r % a.n[4] * a.n[3] + r / a.n[4] : r;
+        for (int j = 0; j < a.n[1]; j++) {
             float mean = tanhf(out[2 * r * a.n[1] + j]), s = sigmoid_of(out[(2 * r + 1) * a.n[1] + j] + 2.0f), std = 0.9f * s + 0.1f;
             float drawn = noise ? noise[from * a.n[1] + j] : 0.0f, action = mean + std * drawn;
             float d = d_action[r * a.n[2] + j] / fmaxf(1.0f, fabsf(action));
@@ -129,15 +129,15 @@ KERNEL(actor_backward) {
 KERNEL(lambda_returns) {
     const float *reward = (const float *)a.p[0], *value = (const float *)a.p[1], *discount = (const float *)a.p[2];
     float *returns = (float *)a.p[3], *weights = (float *)a.p[4];
-    long length = a.n[0], rows = a.n[1];
+    int length = a.n[0], rows = a.n[1];
     FOR_ALL(i, rows) {
         float next = value[(length - 1) * rows + i], weight = 1.0f;
-        for (long t = length - 1; t >= 1; t--) {
+        for (int t = length - 1; t >= 1; t--) {
             float beyond = value[t * rows + i] * (1.0f - a.f[0]) + next * a.f[0];
             next = reward[t * rows + i] + discount[t * rows + i] * beyond;
             returns[(t - 1) * rows + i] = next;
         }
-        for (long t = 0; t < length; t++) {
+        for (int t = 0; t < length; t++) {
             weights[t * rows + i] = weight;
             weight *= discount[t * rows + i];
         }
@@ -152,15 +152,15 @@ KERNEL(actor_loss) {
     const float *weights = (const float *)a.p[4], *entropy = (const float *)a.p[5], *range = (const float *)a.p[6];
     float *loss = (float *)a.p[7], *d_reward = (float *)a.p[8], *d_value = (float *)a.p[9], *d_discount = (float *)a.p[10];
     float *d_entropy = (float *)a.p[11];
-    long length = a.n[0], rows = a.n[1];
+    int length = a.n[0], rows = a.n[1];
     float lambda = a.f[0], scale = fmaxf(1.0f, range[1] - range[0]);
     FOR_ALL(i, rows) {
         float carried = 0.0f;  // gradient of the return at t - 1 by way of those before it
         d_reward[i] = 0.0f;
         d_discount[i] = 0.0f;
         d_value[i] = 0.0f;
-        for (long t = 1; t < length; t++) {
-            long here = t * rows + i, before = here - rows;
+        for (int t = 1; t < length; t++) {
+            int here = t * rows + i, before = here - rows;
             float weight = weights[before] * a.f[2];
             loss[before] = -weights[before] * ((returns[before] - value[before]) / scale + a.f[1] * entropy[before]);
             d_entropy[before] = -weight * a.f[1];
@@ -201,17 +201,17 @@ KERNEL(return_range) {
     float *range = (float *)a.p[1];
     for (int which = 0; which < 2; which++) {
         double place = (double)a.f[which] * (double)(a.n[0] - 1);
-        long below = (long)place;
+        int below = (int)place;
         // The number at place `below` of the sorted ones: the largest u such that fewer than below + 1 numbers lie under it, bit by bit.
         u32 found = 0;
         for (int bit = 31; bit >= 0; bit--) {
             u32 tried = found | 1u << bit;
             float count = 0.0f;  // exact up to 2^24 numbers
-            for (long i = THREAD; i < a.n[0]; i += THREADS) count += ORDERED(x[i]) < tried ? 1.0f : 0.0f;
-            if ((long)block_sum(count) <= below) found = tried;
+            for (int i = THREAD; i < a.n[0]; i += THREADS) count += ORDERED(x[i]) < tried ? 1.0f : 0.0f;
+            if ((int)block_sum(count) <= below) found = tried;
         }
         float low = UNORDERED(found), upto = 0.0f, next = INFINITY;
-        for (long i = THREAD; i < a.n[0]; i += THREADS) {
+        for (int i = THREAD; i < a.n[0]; i += THREADS) {
             upto += ORDERED(x[i]) <= found ? 1.0f : 0.0f;
             if (ORDERED(x[i]) > found) next = fminf(next, x[i]);
         }
@@ -224,7 +224,7 @@ KERNEL(return_range) {
         __syncthreads();
         next = -warp_max(LANE < WARPS ? -smallest[LANE] : -INFINITY);
 #endif
-        float high = (long)upto > below + 1 || below + 1 >= a.n[0] ? low : next;
+        float high = (int)upto > below + 1 || below + 1 >= a.n[0] ? low : next;
         float quantile = low + (high - low) * (float)(place - (double)below);
         if (THREAD == 0) range[which] = (1.0f - a.f[2]) * range[which] + a.f[2] * quantile;
     }

@@ -5,17 +5,17 @@
 // read as B along k an odd one, which spreads them over the banks.
 typedef struct {
     const float *at;
-    long row, column;
+    int row, column;
 } View;
 
-DEVICE void tile(View a, View b, const float *bias, float scale, float *out, long pitch, int add, long rows, long cols, long depth,
+DEVICE void tile(View a, View b, const float *bias, float scale, float *out, int pitch, int add, int rows, int cols, int depth,
                  int thread, int threads) {
-    for (long item = thread; item < rows / 4 * cols; item += threads) {
-        long j = item % cols, i = item / cols * 4;
+    for (int item = thread; item < rows / 4 * cols; item += threads) {
+        int j = item % cols, i = item / cols * 4;
         const float *x = a.at + i * a.row, *y = b.at + j * b.column;
         float s0 = 0.0f, s1 = 0.0f, s2 = 0.0f, s3 = 0.0f;
         if (a.column == 1) {
-            for (long k = 0; k < depth; k += 4) {
+            for (int k = 0; k < depth; k += 4) {
                 Four x0 = *(const Four *)(x + k), x1 = *(const Four *)(x + a.row + k);
                 Four x2 = *(const Four *)(x + 2 * a.row + k), x3 = *(const Four *)(x + 3 * a.row + k);
                 float y0 = y[k * b.row], y1 = y[(k + 1) * b.row], y2 = y[(k + 2) * b.row], y3 = y[(k + 3) * b.row];
@@ -25,7 +25,7 @@ DEVICE void tile(View a, View b, const float *bias, float scale, float *out, lon
                 s3 += x3.x * y0 + x3.y * y1 + x3.z * y2 + x3.w * y3;
             }
         } else {
-            for (long k = 0; k < depth; k++) {
+            for (int k = 0; k < depth; k++) {
                 const float *xk = x + k * a.column;
                 float yk = y[k * b.row];
                 s0 += xk[0] * yk;
@@ -44,11 +44,11 @@ DEVICE void tile(View a, View b, const float *bias, float scale, float *out, lon
 
 // Shared memory of forward and backward. Pitches: `even` of what is read as A along k, `odd` of what is read as B along k, `across` of maps.
 typedef struct {
-    long n, r, m, even, odd, across;
+    int n, r, m, even, odd, across;
     float *wq, *wk, *wv, *wo, *z, *u, *q, *k, *v, *map, *mix, *end;
 } Work;
 
-DEVICE Work layout(float *at, long n, long r, long m) {
+DEVICE Work layout(float *at, int n, int r, int m) {
     Work s;
     s.n = n; s.r = r; s.m = m;
     s.even = m + 4; s.odd = m + 1; s.across = r + 4;
@@ -61,13 +61,13 @@ DEVICE Work layout(float *at, long n, long r, long m) {
     return s;
 }
 
-DEVICE View view(const float *at, long row, long column) {
+DEVICE View view(const float *at, int row, int column) {
     View v = {at, row, column};
     return v;
 }
 
-DEVICE void spread(const float *from, float *to, long pitch, long rows, long m, int thread, int threads) {
-    for (long i = thread; i < rows * m; i += threads) to[i / m * pitch + i % m] = from[i];
+DEVICE void spread(const float *from, float *to, int pitch, int rows, int m, int thread, int threads) {
+    for (int i = thread; i < rows * m; i += threads) to[i / m * pitch + i % m] = from[i];
 }
 
 // The inputs of a row of the batch; weights once a block.
@@ -86,13 +86,13 @@ DEVICE void attend(Work s, Inputs in, int thread, int threads) {
     SYNC();
     tile(view(s.q, s.even, 1), view(s.k, 1, s.odd), 0, 1.0f / sqrtf((float)s.m), s.map, s.across, 0, s.n, s.r, s.m, thread, threads);
     SYNC();
-    for (long row = thread / LANES; row < s.n; row += threads / LANES) {
+    for (int row = thread / LANES; row < s.n; row += threads / LANES) {
         float *x = s.map + row * s.across, largest = -INFINITY, sum = 0.0f;
-        for (long j = thread % LANES; j < s.r; j += LANES) largest = fmaxf(largest, x[j]);
+        for (int j = thread % LANES; j < s.r; j += LANES) largest = fmaxf(largest, x[j]);
         largest = warp_max(largest);
-        for (long j = thread % LANES; j < s.r; j += LANES) sum += x[j] = expf(x[j] - largest);
+        for (int j = thread % LANES; j < s.r; j += LANES) sum += x[j] = expf(x[j] - largest);
         sum = warp_sum(sum);
-        for (long j = thread % LANES; j < s.r; j += LANES) x[j] /= sum;
+        for (int j = thread % LANES; j < s.r; j += LANES) x[j] /= sum;
     }
     SYNC();
     tile(view(s.map, s.across, 1), view(s.v, s.odd, 1), 0, 1.0f, s.mix, s.even, 0, s.n, s.m, s.r, thread, threads);
@@ -117,25 +117,25 @@ KERNEL(interaction_forward) {
     SHARED(shared);
     Work s = layout(shared, a.n[1], a.n[2], a.n[3]);
     const float *gain = (const float *)a.p[10], *shift = (const float *)a.p[11];
-    for (long row = BLOCK; row < a.n[0]; row += BLOCKS) {
+    for (int row = BLOCK; row < a.n[0]; row += BLOCKS) {
         Inputs in = INPUTS(a.n[4], a.n[5]);
         SYNC();
         if (row == BLOCK) load_weights(s, in, THREAD, THREADS);
         attend(s, in, THREAD, THREADS);
         if (a.p[13])
-            for (long i = THREAD; i < s.n * s.m; i += THREADS)
+            for (int i = THREAD; i < s.n * s.m; i += THREADS)
                 ((float *)a.p[13])[row * s.n * s.m + i] = s.mix[i / s.m * s.even + i % s.m];
         // z becomes the sum before the norm.
         tile(view(s.mix, s.even, 1), view(s.wo, 1, s.odd), in.bo, 1.0f, s.z, s.even, 1, s.n, s.m, s.m, THREAD, THREADS);
         SYNC();
-        for (long y = WARP; y < s.n; y += WARPS) {
+        for (int y = WARP; y < s.n; y += WARPS) {
             const float *x = s.z + y * s.even;
             float mean = 0.0f, squares = 0.0f;
-            for (long j = LANE; j < s.m; j += LANES) mean += x[j];
+            for (int j = LANE; j < s.m; j += LANES) mean += x[j];
             mean = warp_sum(mean) / (float)s.m;
-            for (long j = LANE; j < s.m; j += LANES) squares += (x[j] - mean) * (x[j] - mean);
+            for (int j = LANE; j < s.m; j += LANES) squares += (x[j] - mean) * (x[j] - mean);
             float scale = 1.0f / sqrtf(warp_sum(squares) / (float)s.m + a.f[0]);
-            for (long j = LANE; j < s.m; j += LANES) {
+            for (int j = LANE; j < s.m; j += LANES) {
                 if (a.p[14]) ((float *)a.p[14])[(row * s.n + y) * s.m + j] = x[j];
                 ((float *)a.p[12])[row * a.n[6] + y * s.m + j] = (x[j] - mean) * scale * gain[j] + shift[j];
             }
@@ -154,11 +154,11 @@ KERNEL(interaction_forward) {
 KERNEL(interaction_backward) {
     SHARED(shared);
     Work s = layout(shared, a.n[1], a.n[2], a.n[3]);
-    long n = s.n, r = s.r, m = s.m, even = s.even;
+    int n = s.n, r = s.r, m = s.m, even = s.even;
     float *d_sum = s.end, *d_mix = d_sum + n * even, *d_map = d_mix + n * even, *dq = d_map + n * s.across;
     float *dk = dq + n * even, *dv = dk + r * even;
     const float *gain = (const float *)a.p[10], *stats = (const float *)a.p[11];
-    for (long row = BLOCK; row < a.n[0]; row += BLOCKS) {
+    for (int row = BLOCK; row < a.n[0]; row += BLOCKS) {
         Inputs in = INPUTS(a.n[4], a.n[5]);
         SYNC();
         if (row == BLOCK) load_weights(s, in, THREAD, THREADS);
@@ -168,16 +168,16 @@ KERNEL(interaction_backward) {
         // The sum before the norm, again.
         tile(view(s.mix, even, 1), view(s.wo, 1, s.odd), in.bo, 1.0f, d_mix, even, 0, n, m, m, THREAD, THREADS);
         SYNC();
-        for (long y = WARP; y < n; y += WARPS) {
+        for (int y = WARP; y < n; y += WARPS) {
             float mean = stats[2 * (row * n + y)], scale = stats[2 * (row * n + y) + 1], sum = 0.0f, product = 0.0f;
-            for (long j = LANE; j < m; j += LANES) {
+            for (int j = LANE; j < m; j += LANES) {
                 float normed = (s.z[y * even + j] + d_mix[y * even + j] - mean) * scale, d = de[y * m + j] * gain[j];
                 sum += d;
                 product += d * normed;
             }
             sum = warp_sum(sum) / (float)m;
             product = warp_sum(product) / (float)m;
-            for (long j = LANE; j < m; j += LANES) {
+            for (int j = LANE; j < m; j += LANES) {
                 float normed = (s.z[y * even + j] + d_mix[y * even + j] - mean) * scale, d = de[y * m + j] * gain[j];
                 d_sum[y * even + j] = scale * (d - sum - normed * product);
             }
@@ -189,11 +189,11 @@ KERNEL(interaction_backward) {
         tile(view(s.map, 1, s.across), view(d_mix, even, 1), 0, 1.0f, dv, even, 0, r, m, n, THREAD, THREADS);
         SYNC();
         float factor = 1.0f / sqrtf((float)m);
-        for (long y = WARP; y < n; y += WARPS) {
+        for (int y = WARP; y < n; y += WARPS) {
             float sum = 0.0f, *d = d_map + y * s.across, *map = s.map + y * s.across;
-            for (long j = LANE; j < r; j += LANES) sum += d[j] * map[j];
+            for (int j = LANE; j < r; j += LANES) sum += d[j] * map[j];
             sum = warp_sum(sum);
-            for (long j = LANE; j < r; j += LANES) d[j] = map[j] * (d[j] - sum) * factor;
+            for (int j = LANE; j < r; j += LANES) d[j] = map[j] * (d[j] - sum) * factor;
         }
         SYNC();
         tile(view(d_map, s.across, 1), view(s.k, s.odd, 1), 0, 1.0f, dq, even, 0, n, m, r, THREAD, THREADS);
@@ -204,15 +204,15 @@ KERNEL(interaction_backward) {
         SYNC();
         tile(view(dv, even, 1), view(s.wv, s.odd, 1), 0, 1.0f, s.u, even, 1, r, m, m, THREAD, THREADS);
         SYNC();
-        for (long i = THREAD; i < n * m; i += THREADS) dz[i] += d_sum[i / m * even + i % m];
-        for (long i = THREAD; i < r * m; i += THREADS) du[i] = s.u[i / m * even + i % m];
+        for (int i = THREAD; i < n * m; i += THREADS) dz[i] += d_sum[i / m * even + i % m];
+        for (int i = THREAD; i < r * m; i += THREADS) du[i] = s.u[i / m * even + i % m];
         if (a.p[15]) {
             float *store = (float *)a.p[15];
-            for (long i = THREAD; i < n * m; i += THREADS) {
+            for (int i = THREAD; i < n * m; i += THREADS) {
                 store[row * n * m + i] = d_sum[i / m * even + i % m];
                 store[a.n[9] + row * n * m + i] = dq[i / m * even + i % m];
             }
-            for (long i = THREAD; i < r * m; i += THREADS) {
+            for (int i = THREAD; i < r * m; i += THREADS) {
                 store[a.n[10] + row * r * m + i] = dk[i / m * even + i % m];
                 store[a.n[11] + row * r * m + i] = dv[i / m * even + i % m];
             }

@@ -22,9 +22,9 @@ KERNEL(narrow_forward) {
     Four *y = (Four *)a.p[3];
     float *stats = (float *)a.p[4];
     int fours = (int)(a.n[1] / 4), lanes = LANES == 1 ? 1 : fours, each = fours / lanes;
-    long in_grid = BLOCKS * (THREADS / lanes), rows = (a.n[0] + in_grid - 1) / in_grid * in_grid;
-    for (long r = BLOCK * (THREADS / lanes) + THREAD / lanes; r < rows; r += in_grid) {
-        long row = r < a.n[0] ? r : a.n[0] - 1;
+    int in_grid = BLOCKS * (THREADS / lanes), rows = (a.n[0] + in_grid - 1) / in_grid * in_grid;
+    for (int r = BLOCK * (THREADS / lanes) + THREAD / lanes; r < rows; r += in_grid) {
+        int row = r < a.n[0] ? r : a.n[0] - 1;
         float sum = 0.0f, squares = 0.0f;
         const Four *from = x + row * fours + THREAD % lanes;
         for (int i = 0; i < each; i++) sum += from[i].x + from[i].y + from[i].z + from[i].w;
@@ -63,14 +63,14 @@ KERNEL(narrow_backward) {
     Four *dx = (Four *)a.p[5];
     float *partial = (float *)a.p[6];
     int fours = (int)(a.n[1] / 4), lanes = LANES == 1 ? 1 : fours, each = fours / lanes;
-    long in_grid = BLOCKS * (THREADS / lanes), rows = (a.n[0] + in_grid - 1) / in_grid * in_grid;
+    int in_grid = BLOCKS * (THREADS / lanes), rows = (a.n[0] + in_grid - 1) / in_grid * in_grid;
 #ifdef __CUDACC__
     float of_gain[4] = {0.0f, 0.0f, 0.0f, 0.0f}, of_shift[4] = {0.0f, 0.0f, 0.0f, 0.0f};
 #else
     float of_gain[128] = {0}, of_shift[128] = {0};
 #endif
-    for (long r = BLOCK * (THREADS / lanes) + THREAD / lanes; r < rows; r += in_grid) {
-        long row = r < a.n[0] ? r : a.n[0] - 1;
+    for (int r = BLOCK * (THREADS / lanes) + THREAD / lanes; r < rows; r += in_grid) {
+        int row = r < a.n[0] ? r : a.n[0] - 1;
         float mean = stats[2 * row], scale = stats[2 * row + 1], sum = 0.0f, product = 0.0f;
         for (int pass = 0; pass < 2; pass++) {
             for (int i = 0; i < each; i++) {
@@ -138,7 +138,7 @@ KERNEL(narrow_backward) {
     }
 #else
     (void)shared;
-    for (long j = 0; j < a.n[1]; j++) {
+    for (int j = 0; j < a.n[1]; j++) {
         out[j] = of_gain[j];
         out[a.n[1] + j] = of_shift[j];
     }

@@ -5,17 +5,17 @@
 KERNEL(norm_forward) {
     const float *x = (const float *)a.p[0], *gain = (const float *)a.p[1], *shift = (const float *)a.p[2];
     float *y = (float *)a.p[3], *stats = (float *)a.p[4];
-    long rows = a.n[0], width = a.n[1];
+    int rows = a.n[0], width = a.n[1];
     Team t = team(a.n[5]);
-    for (long r = t.first; r < rows; r += t.step) {
+    for (int r = t.first; r < rows; r += t.step) {
         const float *xr = x + r * a.n[2];
         float *yr = y + r * a.n[3];
         float sum = 0.0f, squares = 0.0f;
-        for (long j = t.lane; j < width; j += t.lanes) sum += xr[j];
+        for (int j = t.lane; j < width; j += t.lanes) sum += xr[j];
         float mean = team_sum(t, sum) / (float)width;
-        for (long j = t.lane; j < width; j += t.lanes) squares += (xr[j] - mean) * (xr[j] - mean);
+        for (int j = t.lane; j < width; j += t.lanes) squares += (xr[j] - mean) * (xr[j] - mean);
         float scale = 1.0f / sqrtf(team_sum(t, squares) / (float)width + a.f[0]);
-        for (long j = t.lane; j < width; j += t.lanes) {
+        for (int j = t.lane; j < width; j += t.lanes) {
             float z = (xr[j] - mean) * scale * gain[j] + shift[j];
             yr[j] = a.n[4] ? z * sigmoid_of(z) : z;
         }
@@ -37,13 +37,13 @@ KERNEL(norm_backward) {
     const float *x = (const float *)a.p[0], *gain = (const float *)a.p[1], *shift = (const float *)a.p[2];
     const float *stats = (const float *)a.p[3], *dy = (const float *)a.p[4];
     float *dx = (float *)a.p[5];
-    long rows = a.n[0], width = a.n[1];
+    int rows = a.n[0], width = a.n[1];
     Team t = team(a.n[7]);
-    for (long r = t.first; r < rows; r += t.step) {
+    for (int r = t.first; r < rows; r += t.step) {
         const float *xr = x + r * a.n[2], *dyr = dy + r * a.n[3];
         float *dxr = dx + r * a.n[4];
         float mean = stats[2 * r], scale = stats[2 * r + 1], sum = 0.0f, product = 0.0f;
-        for (long j = t.lane; j < width; j += t.lanes) {
+        for (int j = t.lane; j < width; j += t.lanes) {
             float normed = (xr[j] - mean) * scale, d = dyr[j];
             if (a.n[5]) d = through_silu(normed * gain[j] + shift[j], d);
             sum += d * gain[j];
@@ -51,7 +51,7 @@ KERNEL(norm_backward) {
         }
         sum = team_sum(t, sum) / (float)width;
         product = team_sum(t, product) / (float)width;
-        for (long j = t.lane; j < width; j += t.lanes) {
+        for (int j = t.lane; j < width; j += t.lanes) {
             float normed = (xr[j] - mean) * scale, d = dyr[j];
             if (a.n[5]) d = through_silu(normed * gain[j] + shift[j], d);
             put(dxr + j, a.n[6], scale * (d * gain[j] - sum - normed * product));
@@ -65,13 +65,13 @@ KERNEL(norm_parameters) {
     const float *x = (const float *)a.p[0], *gain = (const float *)a.p[1], *shift = (const float *)a.p[2];
     const float *stats = (const float *)a.p[3], *dy = (const float *)a.p[4];
     float *partial = (float *)a.p[5];
-    long width = a.n[1], blocks = (width + 31) / 32, chunk = BLOCK / blocks, end = (chunk + 1) * a.n[5];
+    int width = a.n[1], blocks = (width + 31) / 32, chunk = BLOCK / blocks, end = (chunk + 1) * a.n[5];
     if (end > a.n[0]) end = a.n[0];
     for (int lane = LANE; lane < 32; lane += LANES) {
-        long j = BLOCK % blocks * 32 + lane;
+        int j = BLOCK % blocks * 32 + lane;
         float of_gain = 0.0f, of_shift = 0.0f;
         if (j < width) {
-            for (long r = chunk * a.n[5] + WARP; r < end; r += WARPS) {
+            for (int r = chunk * a.n[5] + WARP; r < end; r += WARPS) {
                 float normed = (x[r * a.n[2] + j] - stats[2 * r]) * stats[2 * r + 1], d = dy[r * a.n[3] + j];
                 if (a.n[4]) d = through_silu(normed * gain[j] + shift[j], d);
                 of_gain += d * normed;
@@ -92,13 +92,13 @@ KERNEL(norm_parameters) {
 KERNEL(column_sums) {
     const float *x = (const float *)a.p[0];
     float *partial = (float *)a.p[1];
-    long width = a.n[1], blocks = (width + 31) / 32, chunk = BLOCK / blocks, end = (chunk + 1) * a.n[3];
+    int width = a.n[1], blocks = (width + 31) / 32, chunk = BLOCK / blocks, end = (chunk + 1) * a.n[3];
     if (end > a.n[0]) end = a.n[0];
     for (int lane = LANE; lane < 32; lane += LANES) {
-        long j = BLOCK % blocks * 32 + lane;
+        int j = BLOCK % blocks * 32 + lane;
         float sum = 0.0f;
         if (j < width)
-            for (long r = chunk * a.n[3] + WARP; r < end; r += WARPS) sum += x[r * a.n[2] + j];
+            for (int r = chunk * a.n[3] + WARP; r < end; r += WARPS) sum += x[r * a.n[2] + j];
         sum = across_warps(sum);
         if (WARP == 0 && j < width) partial[chunk * width + j] = sum;
     }
@@ -109,10 +109,10 @@ KERNEL(sum_partials) {
     const float *partial = (const float *)a.p[0];
     float *out = (float *)a.p[1];
     for (int lane = LANE; lane < 32; lane += LANES) {
-        long j = BLOCK * 32 + lane;
+        int j = BLOCK * 32 + lane;
         float sum = 0.0f;
         if (j < a.n[1])
-            for (long c = WARP; c < a.n[0]; c += WARPS) sum += partial[c * a.n[2] + a.n[3] + j];
+            for (int c = WARP; c < a.n[0]; c += WARPS) sum += partial[c * a.n[2] + a.n[3] + j];
         sum = across_warps(sum);
         if (WARP == 0 && j < a.n[1]) out[j] += sum;
     }
@@ -124,16 +124,16 @@ KERNEL(cell_forward) {
     const float *pre = (const float *)a.p[0], *gain = (const float *)a.p[1], *shift = (const float *)a.p[2];
     const float *h = (const float *)a.p[3];
     float *next = (float *)a.p[4], *stats = (float *)a.p[5];
-    long d = a.n[1], width = 3 * d;
+    int d = a.n[1], width = 3 * d;
     Team t = team(a.n[5]);
-    for (long r = t.first; r < a.n[0]; r += t.step) {
+    for (int r = t.first; r < a.n[0]; r += t.step) {
         const float *x = pre + r * a.n[2];
         float sum = 0.0f, squares = 0.0f;
-        for (long j = t.lane; j < width; j += t.lanes) sum += x[j];
+        for (int j = t.lane; j < width; j += t.lanes) sum += x[j];
         float mean = team_sum(t, sum) / (float)width;
-        for (long j = t.lane; j < width; j += t.lanes) squares += (x[j] - mean) * (x[j] - mean);
+        for (int j = t.lane; j < width; j += t.lanes) squares += (x[j] - mean) * (x[j] - mean);
         float scale = 1.0f / sqrtf(team_sum(t, squares) / (float)width + a.f[0]);
-        for (long j = t.lane; j < d; j += t.lanes) {
+        for (int j = t.lane; j < d; j += t.lanes) {
             float reset = sigmoid_of((x[j] - mean) * scale * gain[j] + shift[j]);
             float cand = tanhf(reset * ((x[d + j] - mean) * scale * gain[d + j] + shift[d + j]));
             float update = sigmoid_of((x[2 * d + j] - mean) * scale * gain[2 * d + j] + shift[2 * d + j] - 1.0f);
@@ -153,13 +153,13 @@ KERNEL(cell_backward) {
     const float *pre = (const float *)a.p[0], *gain = (const float *)a.p[1], *shift = (const float *)a.p[2];
     const float *h = (const float *)a.p[3], *stats = (const float *)a.p[4], *d_next = (const float *)a.p[5];
     float *d_gates = (float *)a.p[6], *d_pre = (float *)a.p[7], *d_h = (float *)a.p[8];
-    long d = a.n[1], width = 3 * d;
+    int d = a.n[1], width = 3 * d;
     Team t = team(a.n[6]);
-    for (long r = t.first; r < a.n[0]; r += t.step) {
+    for (int r = t.first; r < a.n[0]; r += t.step) {
         const float *x = pre + r * a.n[2];
         float *dz = d_gates + r * width, *dx = d_pre + r * width;
         float mean = stats[2 * r], scale = stats[2 * r + 1], sum = 0.0f, product = 0.0f;
-        for (long j = t.lane; j < d; j += t.lanes) {
+        for (int j = t.lane; j < d; j += t.lanes) {
             float n0 = (x[j] - mean) * scale, n1 = (x[d + j] - mean) * scale, n2 = (x[2 * d + j] - mean) * scale;
             float reset = sigmoid_of(n0 * gain[j] + shift[j]), z1 = n1 * gain[d + j] + shift[d + j];
             float cand = tanhf(reset * z1), update = sigmoid_of(n2 * gain[2 * d + j] + shift[2 * d + j] - 1.0f);
@@ -176,8 +176,8 @@ KERNEL(cell_backward) {
         }
         sum = team_sum(t, sum) / (float)width;
         product = team_sum(t, product) / (float)width;
-        for (long j = t.lane; j < d; j += t.lanes)
-            for (long g = j; g < width; g += d)
+        for (int j = t.lane; j < d; j += t.lanes)
+            for (int g = j; g < width; g += d)
                 dx[g] = scale * (dz[g] * gain[g] - sum - (x[g] - mean) * scale * product);
     }
 }

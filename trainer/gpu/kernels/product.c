@@ -32,21 +32,21 @@ UNROLL
 KERNEL(product_few_rows) {
     const float *x = (const float *)a.p[0], *w = (const float *)a.p[1];
     float *y = (float *)a.p[2];
-    long m = a.n[0], n = a.n[1], k = a.n[2], columns = (n + COLUMNS_AT_ONCE - 1) / COLUMNS_AT_ONCE;
-    long first = BLOCK % columns * COLUMNS_AT_ONCE, from = BLOCK / columns * ROWS_AT_ONCE;
+    int m = a.n[0], n = a.n[1], k = a.n[2], columns = (n + COLUMNS_AT_ONCE - 1) / COLUMNS_AT_ONCE;
+    int first = BLOCK % columns * COLUMNS_AT_ONCE, from = BLOCK / columns * ROWS_AT_ONCE;
     float sums[ROWS_AT_ONCE * COLUMNS_AT_ONCE];
 UNROLL
     for (int i = 0; i < ROWS_AT_ONCE * COLUMNS_AT_ONCE; i++) sums[i] = 0.0f;
-    for (long at = 4 * THREAD; at < k; at += 4 * THREADS) {
+    for (int at = 4 * THREAD; at < k; at += 4 * THREADS) {
         Four of_w[COLUMNS_AT_ONCE];
 UNROLL
         for (int c = 0; c < COLUMNS_AT_ONCE; c++) {
-            long column = first + c < n ? first + c : n - 1;
+            int column = first + c < n ? first + c : n - 1;
             of_w[c] = *(const Four *)(w + column * a.n[4] + at);
         }
 UNROLL
         for (int r = 0; r < ROWS_AT_ONCE; r++) {
-            long row = from + r < m ? from + r : m - 1;
+            int row = from + r < m ? from + r : m - 1;
             Four of_x = *(const Four *)(x + row * a.n[3] + at);
 UNROLL
             for (int c = 0; c < COLUMNS_AT_ONCE; c++)
@@ -67,7 +67,7 @@ UNROLL
     for (int i = 0; i < ROWS_AT_ONCE * COLUMNS_AT_ONCE; i++) {
         float sum = sums[i];
 #endif
-        long row = from + i / COLUMNS_AT_ONCE, column = first + i % COLUMNS_AT_ONCE;
+        int row = from + i / COLUMNS_AT_ONCE, column = first + i % COLUMNS_AT_ONCE;
         if (row < m && column < n) put(y + row * a.n[5] + column, a.n[6], sum);
     }
 }
@@ -78,18 +78,18 @@ KERNEL(product_few_rows_back) {
     SHARED(shared);
     const float *x = (const float *)a.p[0], *w = (const float *)a.p[1];
     float *y = (float *)a.p[2];
-    long m = a.n[0], n = a.n[1], k = a.n[2], columns = (n + 31) / 32, from = BLOCK / columns * ROWS_AT_ONCE;
+    int m = a.n[0], n = a.n[1], k = a.n[2], columns = (n + 31) / 32, from = BLOCK / columns * ROWS_AT_ONCE;
     for (int lane = LANE; lane < 32; lane += LANES) {
-        long column = BLOCK % columns * 32 + lane, inside = column < n ? column : n - 1;
+        int column = BLOCK % columns * 32 + lane, inside = column < n ? column : n - 1;
         float sums[ROWS_AT_ONCE];
 UNROLL
         for (int r = 0; r < ROWS_AT_ONCE; r++) sums[r] = 0.0f;
-        for (long at = 4 * WARP; at < k; at += 4 * WARPS) {
+        for (int at = 4 * WARP; at < k; at += 4 * WARPS) {
             const float *of_w = w + at * a.n[4] + inside;
             float w0 = of_w[0], w1 = of_w[a.n[4]], w2 = of_w[2 * a.n[4]], w3 = of_w[3 * a.n[4]];
 UNROLL
             for (int r = 0; r < ROWS_AT_ONCE; r++) {
-                long row = from + r < m ? from + r : m - 1;
+                int row = from + r < m ? from + r : m - 1;
                 Four of_x = *(const Four *)(x + row * a.n[3] + at);
                 sums[r] += of_x.x * w0 + of_x.y * w1 + of_x.z * w2 + of_x.w * w3;
             }

@@ -12,7 +12,7 @@ KERNEL(copy_rows) {
     const float *x = (const float *)a.p[0];
     float *y = (float *)a.p[1];
     FOR_ALL(i, a.n[0] * a.n[1]) {
-        long r = i / a.n[1], j = i % a.n[1];
+        int r = i / a.n[1], j = i % a.n[1];
         put(y + r * a.n[3] + j, a.n[4], a.f[0] * x[r * a.n[2] + j]);
     }
 }
@@ -23,8 +23,8 @@ KERNEL(gather_rows) {
     float *x = (float *)a.p[0], *y = (float *)a.p[1];
     const u32 *index = (const u32 *)a.p[2];
     FOR_ALL(i, a.n[0] * a.n[1]) {
-        long r = i / a.n[1], j = i % a.n[1];
-        float *from = x + (long)index[r] * a.n[2] + j, *to = y + r * a.n[3] + j;
+        int r = i / a.n[1], j = i % a.n[1];
+        float *from = x + (int)index[r] * a.n[2] + j, *to = y + r * a.n[3] + j;
         if (a.n[4]) *from += *to;
         else *to = *from;
     }
@@ -57,7 +57,7 @@ KERNEL(carry) {
     const float *initial = (const float *)a.p[1], *carried = (const float *)a.p[2];
     float *y = (float *)a.p[3];
     FOR_ALL(i, a.n[0] * a.n[1]) {
-        long r = i / a.n[1], j = i % a.n[1];
+        int r = i / a.n[1], j = i % a.n[1];
         int begins = !carried || first[r];
         y[r * a.n[3] + j] = begins ? (initial ? initial[j] : 0.0f) : carried[r * a.n[2] + j];
     }
@@ -69,10 +69,10 @@ KERNEL(carry_backward) {
     float *d_initial = (float *)a.p[1], *d_carried = (float *)a.p[2];
     const float *dy = (const float *)a.p[3];
     for (int lane = LANE; lane < 32; lane += LANES) {
-        long j = BLOCK * 32 + lane;
+        int j = BLOCK * 32 + lane;
         float sum = 0.0f;
         if (j < a.n[1]) {
-            for (long r = WARP; r < a.n[0]; r += WARPS) {
+            for (int r = WARP; r < a.n[0]; r += WARPS) {
                 float d = dy[r * a.n[3] + j];
                 if (!d_carried || first[r]) sum += d;
                 else d_carried[r * a.n[2] + j] += d;
@@ -97,7 +97,7 @@ KERNEL(normalise_action) {
 KERNEL(sum_of) {
     const float *x = (const float *)a.p[0];
     float sum = 0.0f;
-    for (long i = THREAD; i < a.n[0]; i += THREADS) sum += a.n[1] ? fmaxf(x[i], a.f[1]) : x[i];
+    for (int i = THREAD; i < a.n[0]; i += THREADS) sum += a.n[1] ? fmaxf(x[i], a.f[1]) : x[i];
     sum = block_sum(sum);
     if (THREAD == 0) *(float *)a.p[1] = a.f[0] * sum;
 }
@@ -112,13 +112,14 @@ DEVICE float uniform_of(u32 word) { return ((float)(word >> 9) + 0.5f) * (1.0f /
 
 // Noise out of the ChaCha8 stream that the CPU draws from: words of `key` and `stream`, from word n[2] on. Gumbel, one number a word:
 // -log(-log u); or normal (n[1]), one from two words (Box and Muller). The words are the CPU's; logarithms may round otherwise.
-// p: control (u32: key 8, stream 2), out. n: count, normal, first word (even).
+// p: control (u32: key 8, stream 2), out. n: count, normal, first word (even) as quotient and remainder of 2^24.
 KERNEL(noise) {
     const u32 *control = (const u32 *)a.p[0];
     float *out = (float *)a.p[1];
-    long words = a.n[0] * (a.n[1] ? 2 : 1), from = a.n[2], blocks = (from + words + 15) / 16 - from / 16;
+    long words = (long)a.n[0] * (a.n[1] ? 2 : 1), from = ((long)a.n[2] << 24) + a.n[3];
+    int blocks = (int)((from + words + 15) / 16 - from / 16);
     FOR_ALL(i, blocks) {
-        unsigned long counter = (unsigned long)(from / 16 + i);
+        unsigned long counter = (unsigned long)(from / 16) + i;
         u32 x[16], start[16];
         start[0] = 0x61707865; start[1] = 0x3320646e; start[2] = 0x79622d32; start[3] = 0x6b206574;
         for (int j = 0; j < 8; j++) start[4 + j] = control[j];

@@ -159,7 +159,7 @@ pub enum Command {
         /// Addresses.
         p: Vec<Pointer>,
         /// Counts.
-        n: Vec<i64>,
+        n: Vec<i32>,
         /// Factors.
         f: Vec<f32>,
     },
@@ -283,6 +283,7 @@ const ALIGNMENT: usize = 256;
 impl Program {
     /// A buffer of this many numbers; its contents are undefined until something is written.
     pub fn buffer(&mut self, numbers: usize) -> Place {
+        assert!(numbers < 1 << 31, "kernels count a buffer's numbers in 32 bits");
         self.sizes.push((4 * numbers).next_multiple_of(ALIGNMENT));
         Place::Transient(self.sizes.len() as u32 - 1)
     }
@@ -334,7 +335,8 @@ impl Program {
 
     /// Adds a kernel.
     pub fn kernel(&mut self, kernel: Kernel, grid: Grid, p: &[Pointer], n: &[usize], f: &[f32]) {
-        let n = n.iter().map(|n| *n as i64).collect();
+        let count = |n: &usize| i32::try_from(*n).expect("no matrix has 2^31 numbers");
+        let n = n.iter().map(count).collect();
         self.push(Command::Kernel { kernel, grid, p: p.to_vec(), n, f: f.to_vec() });
     }
 

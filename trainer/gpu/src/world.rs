@@ -358,7 +358,7 @@ pub fn noise(tape: &mut Tape, control: u64, rows: usize, cols: usize, normal: bo
     let out = tape.matrix(rows, cols);
     let blocks = (out.len() * if normal { 2 } else { 1 }).div_ceil(16) + 1;
     let p = [Matrix::fixed(control, 1, 10).into(), out.into()];
-    let n = [out.len(), usize::from(normal), from as usize];
+    let n = [out.len(), usize::from(normal), (from >> 24) as usize, (from & 0xff_ffff) as usize];
     tape.program.kernel(Kernel::Noise, Grid::elements(blocks), &p, &n, &[]);
     out
 }

@@ -5,7 +5,7 @@ use std::time::Instant;
 use super::{Args, PartTime, begin};
 use crate::program::{Command, Finished, Product};
 
-pub(super) type Function = unsafe extern "C" fn(Args, i64, i64);
+pub(super) type Function = unsafe extern "C" fn(Args, i32, i32);
 
 pub(super) mod functions {
     use super::super::{Args, host_functions};
@@ -90,9 +90,9 @@ fn execute(command: &Command) {
             // Loops over numbers and rows take any number of blocks; where the blocks are what is counted, all of them run.
             let args = Args::new(p, n, f);
             let function = kernel.on_host();
-            for block in 0..grid.blocks as i64 {
+            for block in 0..grid.blocks as i32 {
                 // SAFETY: the arguments are those that the kernel's description names, and its buffers are as large as its counts say.
-                unsafe { function(args, block, grid.blocks as i64) }
+                unsafe { function(args, block, grid.blocks as i32) }
             }
         }
         Command::HandOver => (),

@@ -268,7 +268,7 @@ macro_rules! kernels {
             }
         }
 
-        macro_rules! host_functions { () => { $(pub fn $name(a: Args, block: i64, blocks: i64);)* } }
+        macro_rules! host_functions { () => { $(pub fn $name(a: Args, block: i32, blocks: i32);)* } }
         pub(in crate::machine) use host_functions;
     };
 }
@@ -293,12 +293,12 @@ kernels! {
 #[derive(Debug, Clone, Copy, Default)]
 pub(in crate::machine) struct Args {
     p: [u64; 16],
-    n: [i64; 16],
+    n: [i32; 16],
     f: [f32; 8],
 }
 
 impl Args {
-    fn new(p: &[crate::program::Pointer], n: &[i64], f: &[f32]) -> Self {
+    fn new(p: &[crate::program::Pointer], n: &[i32], f: &[f32]) -> Self {
         let mut args = Self::default();
         for (to, from) in args.p.iter_mut().zip(p) {
             *to = from.place.map_or(0, |place| address(place) + from.bytes as u64);

@@ -337,7 +337,7 @@ fn describe(command: &Command) -> String {
     match command {
         Command::HandOver => String::new(),
         Command::Kernel { kernel, grid, n, .. } => {
-            let sizes: Vec<String> = n.iter().take(3).map(i64::to_string).collect();
+            let sizes: Vec<String> = n.iter().take(3).map(i32::to_string).collect();
             format!("{} {}x{} {}", kernel.name(), grid.blocks, grid.threads, sizes.join(","))
         }
         Command::Product(product) => {
