@@ -49,37 +49,65 @@ KERNEL(tanh_of) {
     }
 }
 
-// The carried state of a step: `initial` [1, width] where an episode begins, else `carried`; without `initial` zero, and without
-// `carried` (the first step of a sequence) `initial` everywhere. p: first (u32) [rows], initial, carried, y. n: rows, width, stride of
-// carried, of y.
+// The carried state of a step, z and h: `initial` [1, width] where an episode begins, else `carried`; without `carried` (the first step of a
+// sequence) `initial` everywhere. p: first (u32) [rows], initial z, h, carried z, h, y of z, of h. n: rows, width of z, of h, stride of
+// carried z, of carried h, of y of z, of h.
 KERNEL(carry) {
     const u32 *first = (const u32 *)a.p[0];
-    const float *initial = (const float *)a.p[1], *carried = (const float *)a.p[2];
-    float *y = (float *)a.p[3];
-    FOR_ALL(i, a.n[0] * a.n[1]) {
-        int r = i / a.n[1], j = i % a.n[1];
+    u32 width = (u32)(a.n[1] + a.n[2]);
+    FOR_ALL(i, a.n[0] * a.n[1] + a.n[0] * a.n[2]) {
+        int r = (int)(i / width), j = (int)(i % width), of_h = j >= a.n[1];
+        if (of_h) j -= a.n[1];
+        const float *initial = (const float *)a.p[1 + of_h], *carried = (const float *)a.p[3 + of_h];
+        float *y = (float *)a.p[5 + of_h];
         int begins = !carried || first[r];
-        y[r * a.n[3] + j] = begins ? (initial ? initial[j] : 0.0f) : carried[r * a.n[2] + j];
+        y[r * a.n[5 + of_h] + j] = begins ? initial[j] : carried[r * a.n[3 + of_h] + j];
     }
 }
 
-// p: first, d_initial (added to), d_carried (added to), dy. n as `carry`, of the gradients.
+// p: first, d_initial of z, of h (added to), d_carried of z, of h (added to), dy of z, of h. n as `carry`, of the gradients. 32 columns a turn.
 KERNEL(carry_backward) {
     const u32 *first = (const u32 *)a.p[0];
-    float *d_initial = (float *)a.p[1], *d_carried = (float *)a.p[2];
-    const float *dy = (const float *)a.p[3];
-    for (int lane = LANE; lane < 32; lane += LANES) {
-        int j = BLOCK * 32 + lane;
-        float sum = 0.0f;
-        if (j < a.n[1]) {
-            for (int r = WARP; r < a.n[0]; r += WARPS) {
-                float d = dy[r * a.n[3] + j];
-                if (!d_carried || first[r]) sum += d;
-                else d_carried[r * a.n[2] + j] += d;
+    int of_z = (a.n[1] + 31) / 32, turns = of_z + (a.n[2] + 31) / 32;
+    for (int turn = BLOCK; turn < turns; turn += BLOCKS) {
+        int of_h = turn >= of_z, width = a.n[1 + of_h], d_stride = a.n[3 + of_h], stride = a.n[5 + of_h];
+        float *d_initial = (float *)a.p[1 + of_h], *d_carried = (float *)a.p[3 + of_h];
+        const float *dy = (const float *)a.p[5 + of_h];
+        for (int lane = LANE; lane < 32; lane += LANES) {
+            int j = (of_h ? turn - of_z : turn) * 32 + lane;
+            float sum = 0.0f;
+            if (j < width) {
+                for (int r = WARP; r < a.n[0]; r += WARPS) {
+                    float d = dy[r * stride + j];
+                    if (!d_carried || first[r]) sum += d;
+                    else d_carried[r * d_stride + j] += d;
+                }
             }
+            sum = across_warps(sum);
+            if (WARP == 0 && j < width) d_initial[j] += sum;
         }
-        sum = across_warps(sum);
-        if (WARP == 0 && j < a.n[1] && d_initial) d_initial[j] += sum;
+    }
+}
+
+// y [width, rows] = x^T, 32 by 32 numbers a turn. p: x, y. n: rows, width, stride of x.
+KERNEL(transpose) {
+    const float *x = (const float *)a.p[0];
+    float *y = (float *)a.p[1];
+    int rows = a.n[0], width = a.n[1], across = (width + 31) / 32, turns = across * ((rows + 31) / 32);
+    for (int turn = BLOCK; turn < turns; turn += BLOCKS) {
+        int from = turn / across * 32, left = turn % across * 32;
+#ifdef __CUDACC__
+        __shared__ float part[32][33];
+        for (int r = WARP; r < 32; r += WARPS)
+            if (from + r < rows && left + LANE < width) part[r][LANE] = x[(from + r) * a.n[2] + left + LANE];
+        __syncthreads();
+        for (int j = WARP; j < 32; j += WARPS)
+            if (left + j < width && from + LANE < rows) y[(left + j) * rows + from + LANE] = part[LANE][j];
+        __syncthreads();
+#else
+        for (int r = from; r < from + 32 && r < rows; r++)
+            for (int j = left; j < left + 32 && j < width; j++) y[j * rows + r] = x[r * a.n[2] + j];
+#endif
     }
 }
 

@@ -175,8 +175,9 @@ fn rollout(
         .enumerate()
         .map(|(at, branch)| Head::prior(tape, branch, reached(column(at, 1))))
         .collect();
-    let interaction = (branches.len() == 2)
-        .then(|| Interacting::new(tape, sources.frozen, &sizes.model, rooms[1].input, reached(column(0, 1))));
+    let interaction = (branches.len() == 2).then(|| {
+        Interacting::new(tape, sources.frozen, &sizes.model, n, (rooms[1].input, reached(column(0, 1))))
+    });
     let entropy = tape.matrix(steps, 1);
     let actor = Stepping::new(tape, sources.actor.mlp("actor"), states.rows(0..steps));
     let mut next_noise = |tape: &mut Tape, cols: usize, normal: bool| {

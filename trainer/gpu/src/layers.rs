@@ -2,7 +2,7 @@
 //! scan over time has one product a weight and not one a step: what collects is added before the scan and so runs after it backward.
 
 use crate::machine::Kernel;
-use crate::program::{Grid, Matrix, Pointer};
+use crate::program::{FEW_ROWS, Grid, Matrix, Pointer};
 use crate::tape::{Tape, chunks_of};
 use crate::weights::{Array, Weights};
 
@@ -22,6 +22,8 @@ pub struct Weight {
     pub value: Matrix,
     /// Where its gradient is added up.
     pub gradient: Option<Matrix>,
+    /// The other way round, where it is read so on the way back of few rows.
+    pub transposed: Option<Matrix>,
 }
 
 impl Weight {
@@ -29,7 +31,8 @@ impl Weight {
     #[must_use]
     pub fn columns(self, columns: std::ops::Range<usize>) -> Self {
         let cut = |matrix: Matrix| matrix.columns(columns.clone());
-        Self { value: cut(self.value), gradient: self.gradient.map(cut) }
+        let transposed = self.transposed.map(|matrix| matrix.rows(columns.clone()));
+        Self { value: cut(self.value), gradient: self.gradient.map(cut), transposed }
     }
 }
 
@@ -106,7 +109,7 @@ impl Source<'_> {
     #[must_use]
     pub fn weight(&self, name: &str) -> Weight {
         let gradient = (self.trains)(name).then(|| self.weights.matrix(Array::Gradients, name));
-        Weight { value: self.weights.matrix(Array::Values, name), gradient }
+        Weight { value: self.weights.matrix(Array::Values, name), gradient, transposed: None }
     }
 
     /// `NAME.weight` and `NAME.bias` of a norm.
@@ -160,12 +163,28 @@ impl Tape {
         self.product((x, false), (weight.value, true), y, add);
     }
 
+    /// The weight with a copy that lies the other way round, for products with `rows` at a time: where they are few, a kernel that reads along the
+    /// rows of the copy is much faster than one that reads across those of the weight.
+    pub fn transposed(&mut self, weight: Weight, rows: usize) -> Weight {
+        if rows > FEW_ROWS {
+            return weight;
+        }
+        let x = weight.value;
+        let y = self.matrix(x.cols, x.rows);
+        let grid = Grid { blocks: x.rows.div_ceil(32) * x.cols.div_ceil(32), threads: 256, shared_bytes: 0 };
+        let n = [x.rows, x.cols, x.stride];
+        self.program.kernel(Kernel::Transpose, grid, &[x.into(), y.into()], &n, &[]);
+        Weight { transposed: Some(y), ..weight }
+    }
+
     /// The way back of [`Tape::linear`] to x.
     pub fn linear_back(&mut self, x: Matrix, weight: Weight, y: Matrix) {
         self.on_backward(move |tape| {
             let dy = tape.gradient_of(y);
             let (dx, add) = tape.gradient_term(x);
-            tape.product((dy, false), (weight.value, false), dx, add);
+            let few = dy.rows <= FEW_ROWS;
+            let back = weight.transposed.filter(|_| few).map_or((weight.value, false), |back| (back, true));
+            tape.product((dy, false), back, dx, add);
         });
     }
 
@@ -352,18 +371,32 @@ impl Tape {
         });
     }
 
-    /// The state that some rows carry: `initial` where `first` is set, else `carried`; all `initial` without `carried`.
-    pub fn carry(&mut self, first: Matrix, initial: Matrix, carried: Option<Matrix>, y: Matrix) {
-        let n = [y.rows, y.cols, carried.map_or(0, |m| m.stride), y.stride];
-        let p = [first.into(), initial.into(), carried.into(), y.into()];
-        self.program.kernel(Kernel::Carry, Grid::elements(y.len()), &p, &n, &[]);
+    /// The state that some rows carry, z and h: `initial` where `first` is set, else `carried`; all `initial` without `carried`.
+    pub fn carry(
+        &mut self,
+        first: Matrix,
+        initial: [Matrix; 2],
+        carried: Option<[Matrix; 2]>,
+        y: [Matrix; 2],
+    ) {
+        let arguments = move |initial: [Matrix; 2], carried: Option<[Matrix; 2]>, y: [Matrix; 2]| {
+            let of_carried = carried.map_or([Pointer::NULL; 2], |both| both.map(Pointer::from));
+            let strides = carried.map_or([0; 2], |both| both.map(|x| x.stride));
+            let p = [&[first.into()][..], &initial.map(Pointer::from), &of_carried, &y.map(Pointer::from)]
+                .concat();
+            let [z, h] = y;
+            (p, [z.rows, z.cols, h.cols, strides[0], strides[1], z.stride, h.stride])
+        };
+        let (p, n) = arguments(initial, carried, y);
+        let numbers = y[0].len() + y[1].len();
+        self.program.kernel(Kernel::Carry, Grid::elements(numbers), &p, &n, &[]);
         self.on_backward(move |tape| {
-            let dy = tape.gradient_of(y);
-            let d_initial = tape.gradient_sum(initial);
-            let d_carried = carried.map(|carried| tape.gradient_sum(carried));
-            let n = [y.rows, y.cols, d_carried.map_or(0, |m| m.stride), dy.stride];
-            let p = [first.into(), d_initial.into(), d_carried.into(), dy.into()];
-            let grid = Grid { blocks: y.cols.div_ceil(32), threads: 512, shared_bytes: 0 };
+            let dy = y.map(|y| tape.gradient_of(y));
+            let d_initial = initial.map(|x| tape.gradient_sum(x));
+            let d_carried = carried.map(|both| both.map(|x| tape.gradient_sum(x)));
+            let (p, n) = arguments(d_initial, d_carried, dy);
+            let blocks = y[0].cols.div_ceil(32) + y[1].cols.div_ceil(32);
+            let grid = Grid { blocks, threads: 512, shared_bytes: 0 };
             tape.program.kernel(Kernel::CarryBackward, grid, &p, &n, &[]);
         });
     }
@@ -484,7 +517,7 @@ impl Tape {
                     let d_windows = tape.matrix(dy.rows, 16 * channels);
                     tape.product((dy, false), (weight.value, false), d_windows, false);
                     let rows = chunk.start * side * side..chunk.end * side * side;
-                    tape.from_windows(d_windows, dx.rows(rows), side, None, add);
+                    tape.add_up_windows(d_windows, dx.rows(rows), side, None, add);
                 }
             }
         });
@@ -508,7 +541,7 @@ impl Tape {
             let (small, large) = parts(&chunk);
             let windows = self.matrix(small.len(), 16 * out);
             self.product((x.rows(small), false), (weight.value, false), windows, false);
-            self.from_windows(windows, y.rows(large), twice, bias, false);
+            self.add_up_windows(windows, y.rows(large), twice, bias, false);
         }
         self.on_backward(move |tape| {
             let dy = tape.gradient_of(y);
@@ -543,7 +576,7 @@ impl Tape {
         windows
     }
 
-    fn from_windows(&mut self, windows: Matrix, x: Matrix, side: usize, bias: Option<Weight>, add: bool) {
+    fn add_up_windows(&mut self, windows: Matrix, x: Matrix, side: usize, bias: Option<Weight>, add: bool) {
         let p = [windows.into(), x.into(), bias.map(|bias| bias.value).into()];
         let n = [x.rows / (side * side), side, x.cols, usize::from(add)];
         self.program.kernel(Kernel::FromWindows, Grid::elements(x.len() / 4), &p, &n, &[]);

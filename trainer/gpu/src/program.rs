@@ -119,7 +119,7 @@ pub struct Grid {
 }
 
 /// Rows up to which products are done by kernels of our own.
-const FEW_ROWS: usize = 32;
+pub const FEW_ROWS: usize = 32;
 /// Blocks beyond which a kernel's threads take turns.
 const BLOCKS_MAX: usize = 132 * 16;
 

@@ -165,6 +165,25 @@ impl Branch {
             initial: source.weight(&at("initial")),
         }
     }
+
+    /// The same with copies of the weights that the way back of `rows` at a time reads.
+    #[must_use]
+    pub fn transposed(self, tape: &mut Tape, rows: usize) -> Self {
+        let mut copied = |weight: Weight| tape.transposed(weight, rows);
+        let [of_h, of_embed] = self.posterior;
+        Self {
+            input: Dense { weight: copied(self.input.weight), ..self.input },
+            cell: copied(self.cell),
+            prior: Dense { weight: copied(self.prior.weight), ..self.prior },
+            prior_logits: Linear { weight: copied(self.prior_logits.weight), ..self.prior_logits },
+            posterior: [copied(of_h), of_embed],
+            posterior_logits: Linear {
+                weight: copied(self.posterior_logits.weight),
+                ..self.posterior_logits
+            },
+            ..self
+        }
+    }
 }
 
 /// What the recurrence of a branch works in, all rows.
@@ -287,8 +306,16 @@ pub struct Interacting {
 
 impl Interacting {
     /// Room for rows; e goes to `e` [rows, n m] and h^R comes from `h` [rows, d]. Collects the weights' gradients over all of them.
-    pub fn new(tape: &mut Tape, source: Source<'_>, model: &ModelSettings, e: Matrix, h: Matrix) -> Self {
-        let parts = source.interaction();
+    /// Steps have `at_once` rows each.
+    pub fn new(
+        tape: &mut Tape,
+        source: Source<'_>,
+        model: &ModelSettings,
+        at_once: usize,
+        (e, h): (Matrix, Matrix),
+    ) -> Self {
+        let mut parts = source.interaction();
+        parts.deter.weight = tape.transposed(parts.deter.weight, at_once);
         let (rows, nm, m) = (e.rows, model.stoch_width(), model.classes);
         let wide = nm + model.interaction_rows() * m;
         let trained = parts.deter.weight.gradient.is_some();
@@ -450,8 +477,10 @@ fn scan(
         gumbel.map(|gumbel| gumbel.rows(from..from + b))
     };
     let draw = sizes.draw(None);
-    let branches: Vec<Branch> =
-        branch_names(sizes.model.kind).iter().map(|name| Branch::new(source, name, &sizes.model)).collect();
+    let branches: Vec<Branch> = branch_names(sizes.model.kind)
+        .iter()
+        .map(|name| Branch::new(source, name, &sizes.model).transposed(tape, b))
+        .collect();
     let columns: Vec<_> = (0..branches.len()).map(|branch| sizes.columns(branch)).collect();
     let h_of = |branch: usize| features.columns(columns[branch].1.clone());
     let z_of = |branch: usize| features.columns(columns[branch].0.clone());
@@ -483,7 +512,7 @@ fn scan(
         .collect();
     let interaction = (branches.len() == 2).then(|| {
         let head = Head::prior(tape, &branches[0], h_of(0));
-        (head, Interacting::new(tape, source, &sizes.model, rooms[1].input, h_of(0)))
+        (head, Interacting::new(tape, source, &sizes.model, b, (rooms[1].input, h_of(0))))
     });
     let actions = Matrix::fixed(inputs.action, rows, sizes.model.action);
     tape.copy(actions, rooms[0].input.columns(nm..nm + sizes.model.action), false, 1.0);
@@ -498,8 +527,8 @@ fn scan(
             let carry = |tape: &mut Tape, branch: usize, z: Matrix| {
                 let carried = |x: Matrix| (t > 0).then(|| x.rows((t - 1) * b..t * b));
                 let (z_0, h_0) = initial[branch];
-                tape.carry(first, z_0, carried(z_of(branch)), at(z));
-                tape.carry(first, h_0, carried(h_of(branch)), at(rooms[branch].before()));
+                let before = carried(z_of(branch)).zip(carried(h_of(branch))).map(|(z, h)| [z, h]);
+                tape.carry(first, [z_0, h_0], before, [at(z), at(rooms[branch].before())]);
             };
             carry(tape, 0, rooms[0].input.columns(0..nm));
             rooms[0].step(tape, &branches[0], here.clone(), at(h_of(0)));
