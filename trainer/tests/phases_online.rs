@@ -13,6 +13,7 @@ use std::time::Duration;
 
 use candle_core::{Device, Tensor};
 use ndarray::{Array1, Array2, Array4};
+use rcwm_gpu::Machine;
 use rcwm_models::episode::Episode;
 use rcwm_models::settings::{ModelKind, Preset};
 use rcwm_models::wire::{LinkSettings, ObservationFlags, SimulatorLink, Wait};
@@ -23,7 +24,7 @@ use rcwm_trainer::model::latent::{FirstSteps, Sampler};
 use rcwm_trainer::model::parameters::Parameters;
 use rcwm_trainer::replay::Folder;
 use rcwm_trainer::training::{
-    Finetuning, OnlineOutcome, Phase, Run, TrainingError, TrainingSettings, episodes_folder,
+    Compute, Finetuning, OnlineOutcome, Phase, Run, TrainingError, TrainingSettings, episodes_folder,
 };
 
 const EPISODE_STEPS: u32 = 6;
@@ -158,13 +159,18 @@ fn lines(folder: &Path) -> Vec<serde_json::Value> {
 
 #[test]
 fn the_policy_acts_in_all_simulators_and_learns_as_the_ratio_says() {
-    for kind in [ModelKind::Rcwm, ModelKind::Vanilla] {
+    let cases = [
+        (ModelKind::Rcwm, Compute::from(&Device::Cpu)),
+        (ModelKind::Vanilla, Compute::from(&Device::Cpu)),
+        (ModelKind::Rcwm, Compute::Programs(Machine::host())),
+    ];
+    for (kind, compute) in cases {
         let folder = tempfile::tempdir().unwrap();
         let (home, out) = (folder.path().join("data"), folder.path().join("run"));
         data(&home);
         let settings = settings(kind, &home);
         let simulators = [Simulator::start(1000), Simulator::start(1000)];
-        let mut training = Finetuning::create(&out, settings.clone(), None, &Device::Cpu).unwrap();
+        let mut training = Finetuning::create(&out, settings.clone(), None, compute).unwrap();
         let outcome = run(&mut training, &[&simulators[0], &simulators[1]]).unwrap();
         // Two decisions a round: the round in which step 40 is reached is the last.
         assert_eq!(outcome.policy_steps, 40);
@@ -195,19 +201,28 @@ fn the_policy_acts_in_all_simulators_and_learns_as_the_ratio_says() {
 
 #[test]
 fn a_resumed_run_has_its_weights_counters_and_replay_back() {
+    resumed_has_everything_back(|| (&Device::Cpu).into());
+}
+
+#[test]
+fn a_resumed_run_of_programs_has_them_back_too() {
+    resumed_has_everything_back(|| Compute::Programs(Machine::host()));
+}
+
+fn resumed_has_everything_back(compute: impl Fn() -> Compute) {
     let folder = tempfile::tempdir().unwrap();
     let (home, out) = (folder.path().join("data"), folder.path().join("run"));
     data(&home);
     let settings = settings(ModelKind::Rcwm, &home);
     let simulator = Simulator::start(3);
-    let mut training = Finetuning::create(&out, settings.clone(), None, &Device::Cpu).unwrap();
+    let mut training = Finetuning::create(&out, settings.clone(), None, compute()).unwrap();
     let outcome = run(&mut training, &[&simulator]).unwrap();
     assert!(outcome.interrupted, "the only simulator has ended after three episodes");
     assert_eq!((outcome.policy_steps, outcome.episodes), (18, 3));
     let (before, state) = (bits(training.parameters()), training.state().clone());
     drop(training);
 
-    let mut training = Finetuning::resume(&out, Run::settings(&out).unwrap(), &Device::Cpu).unwrap();
+    let mut training = Finetuning::resume(&out, Run::settings(&out).unwrap(), compute()).unwrap();
     assert!(bits(training.parameters()) == before);
     assert_eq!((training.state().policy_steps, training.state().episodes), (18, 3));
     assert_eq!(training.state().updates, state.updates);
