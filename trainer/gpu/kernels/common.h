@@ -67,7 +67,7 @@ typedef struct {
 DEVICE Team team_of(int wide, int BLOCK, int BLOCKS) {
     Team t;
     t.wide = wide;
-    t.first = wide ? BLOCK : BLOCK * WARPS + WARP;
+    t.first = wide ? BLOCK : WARP * BLOCKS + BLOCK;
     t.step = wide ? BLOCKS : BLOCKS * WARPS;
     t.lane = wide ? THREAD : LANE;
     t.lanes = wide ? THREADS : LANES;

@@ -1,8 +1,9 @@
 #include "common.h"
 
 // out [rows, cols] = scale * (A B) + bias, or added to out, by a block: A(i, k) = a[i ar + k ac], B(k, j) = b[k br + j bc]. Rows and depth are
-// multiples of 4; a thread does four rows of a column. Arrays that are read as A along k have a pitch that is a multiple of 4, those that are
-// read as B along k an odd one, which spreads them over the banks.
+// multiples of 4; a thread does four rows of a column. Arrays that are read as A have a pitch that is a multiple of 4, those that are read as B
+// along k an odd one, which spreads them over the banks. Products that do not wait for each other begin at different threads (`TURNED`), so
+// that those without work in one have some in the next.
 typedef struct {
     const float *at;
     int row, column;
@@ -25,13 +26,14 @@ DEVICE void tile(View a, View b, const float *bias, float scale, float *out, int
                 s3 += x3.x * y0 + x3.y * y1 + x3.z * y2 + x3.w * y3;
             }
         } else {
+            // Rows follow each other: four at once.
             for (int k = 0; k < depth; k++) {
-                const float *xk = x + k * a.column;
+                Four xk = *(const Four *)(x + k * a.column);
                 float yk = y[k * b.row];
-                s0 += xk[0] * yk;
-                s1 += xk[a.row] * yk;
-                s2 += xk[2 * a.row] * yk;
-                s3 += xk[3 * a.row] * yk;
+                s0 += xk.x * yk;
+                s1 += xk.y * yk;
+                s2 += xk.z * yk;
+                s3 += xk.w * yk;
             }
         }
         float shift = bias ? bias[j] : 0.0f, *to = out + i * pitch + j;
@@ -66,23 +68,64 @@ DEVICE View view(const float *at, int row, int column) {
     return v;
 }
 
-DEVICE void spread(const float *from, float *to, int pitch, int rows, int m, int thread, int threads) {
-    for (int i = thread; i < rows * m; i += threads) to[i / m * pitch + i % m] = from[i];
-}
+// This thread's number where the first `taken` threads have work already.
+#define TURNED(taken) ((thread + threads - (taken) % threads) % threads)
 
 // The inputs of a row of the batch; weights once a block.
 typedef struct {
     const float *z, *u, *wq, *bq, *wk, *bk, *wv, *bv, *wo, *bo;
 } Inputs;
 
+#define AT_ONCE 4
+
+// z and u of a row of the batch, and the weights where `weights`, to shared memory: by four, and several loads of a thread under way.
+DEVICE void load(Work s, Inputs in, int weights, int thread, int threads) {
+    u32 m = (u32)s.m, fours = m / 4, rows = (u32)(s.n + s.r) + (weights ? 4 * m : 0), count = rows * fours;
+    for (u32 base = (u32)thread; base < count; base += AT_ONCE * (u32)threads) {
+        Four held[AT_ONCE];
+        float *to[AT_ONCE];
+UNROLL
+        for (int c = 0; c < AT_ONCE; c++) {
+            u32 i = base + (u32)(c * threads), y = i / fours, x = i % fours * 4, which;
+            Four none = {0.0f, 0.0f, 0.0f, 0.0f};
+            to[c] = 0;
+            held[c] = none;
+            if (i >= count) continue;
+            const float *from;
+            if (y < (u32)s.n) {
+                from = in.z;
+                to[c] = s.z + y * (u32)s.even;
+            } else if ((y -= (u32)s.n) < (u32)s.r) {
+                from = in.u;
+                to[c] = s.u + y * (u32)s.even;
+            } else {
+                y -= (u32)s.r;
+                which = y / m;
+                y %= m;
+                from = which < 2 ? which < 1 ? in.wq : in.wk : which < 3 ? in.wv : in.wo;
+                to[c] = s.wq + (which * m + y) * (u32)s.odd;  // the weights follow each other
+            }
+            to[c] += x;
+            held[c] = *(const Four *)(from + y * m + x);
+        }
+UNROLL
+        for (int c = 0; c < AT_ONCE; c++) {
+            if (!to[c]) continue;
+            to[c][0] = held[c].x;
+            to[c][1] = held[c].y;
+            to[c][2] = held[c].z;
+            to[c][3] = held[c].w;
+        }
+    }
+}
+
 // Projections, attention and mixture of one row of the batch.
 DEVICE void attend(Work s, Inputs in, int thread, int threads) {
-    spread(in.z, s.z, s.even, s.n, s.m, thread, threads);
-    spread(in.u, s.u, s.even, s.r, s.m, thread, threads);
+    int of_z = s.n / 4 * s.m, of_u = s.r / 4 * s.m;
     SYNC();
     tile(view(s.z, s.even, 1), view(s.wq, 1, s.odd), in.bq, 1.0f, s.q, s.even, 0, s.n, s.m, s.m, thread, threads);
-    tile(view(s.u, s.even, 1), view(s.wk, 1, s.odd), in.bk, 1.0f, s.k, s.odd, 0, s.r, s.m, s.m, thread, threads);
-    tile(view(s.u, s.even, 1), view(s.wv, 1, s.odd), in.bv, 1.0f, s.v, s.odd, 0, s.r, s.m, s.m, thread, threads);
+    tile(view(s.u, s.even, 1), view(s.wk, 1, s.odd), in.bk, 1.0f, s.k, s.odd, 0, s.r, s.m, s.m, TURNED(of_z), threads);
+    tile(view(s.u, s.even, 1), view(s.wv, 1, s.odd), in.bv, 1.0f, s.v, s.odd, 0, s.r, s.m, s.m, TURNED(of_z + of_u), threads);
     SYNC();
     tile(view(s.q, s.even, 1), view(s.k, 1, s.odd), 0, 1.0f / sqrtf((float)s.m), s.map, s.across, 0, s.n, s.r, s.m, thread, threads);
     SYNC();
@@ -99,13 +142,6 @@ DEVICE void attend(Work s, Inputs in, int thread, int threads) {
     SYNC();
 }
 
-DEVICE void load_weights(Work s, Inputs in, int thread, int threads) {
-    spread(in.wq, s.wq, s.odd, s.m, s.m, thread, threads);
-    spread(in.wk, s.wk, s.odd, s.m, s.m, thread, threads);
-    spread(in.wv, s.wv, s.odd, s.m, s.m, thread, threads);
-    spread(in.wo, s.wo, s.odd, s.m, s.m, thread, threads);
-}
-
 #define INPUTS(z_stride, u_stride)                                                                                             \
     {(const float *)a.p[0] + row * (z_stride), (const float *)a.p[1] + row * (u_stride), (const float *)a.p[2], (const float *)a.p[3], \
      (const float *)a.p[4], (const float *)a.p[5], (const float *)a.p[6], (const float *)a.p[7], (const float *)a.p[8], (const float *)a.p[9]}
@@ -117,16 +153,17 @@ KERNEL(interaction_forward) {
     SHARED(shared);
     Work s = layout(shared, a.n[1], a.n[2], a.n[3]);
     const float *gain = (const float *)a.p[10], *shift = (const float *)a.p[11];
+    int thread = THREAD, threads = THREADS;
     for (int row = BLOCK; row < a.n[0]; row += BLOCKS) {
         Inputs in = INPUTS(a.n[4], a.n[5]);
         SYNC();
-        if (row == BLOCK) load_weights(s, in, THREAD, THREADS);
-        attend(s, in, THREAD, THREADS);
+        load(s, in, row == BLOCK, thread, threads);
+        attend(s, in, thread, threads);
         if (a.p[13])
             for (int i = THREAD; i < s.n * s.m; i += THREADS)
                 ((float *)a.p[13])[row * s.n * s.m + i] = s.mix[i / s.m * s.even + i % s.m];
         // z becomes the sum before the norm.
-        tile(view(s.mix, s.even, 1), view(s.wo, 1, s.odd), in.bo, 1.0f, s.z, s.even, 1, s.n, s.m, s.m, THREAD, THREADS);
+        tile(view(s.mix, s.even, 1), view(s.wo, 1, s.odd), in.bo, 1.0f, s.z, s.even, 1, s.n, s.m, s.m, thread, threads);
         SYNC();
         for (int y = WARP; y < s.n; y += WARPS) {
             const float *x = s.z + y * s.even;
@@ -158,15 +195,16 @@ KERNEL(interaction_backward) {
     float *d_sum = s.end, *d_mix = d_sum + n * even, *d_map = d_mix + n * even, *dq = d_map + n * s.across;
     float *dk = dq + n * even, *dv = dk + r * even;
     const float *gain = (const float *)a.p[10], *stats = (const float *)a.p[11];
+    int thread = THREAD, threads = THREADS;
     for (int row = BLOCK; row < a.n[0]; row += BLOCKS) {
         Inputs in = INPUTS(a.n[4], a.n[5]);
         SYNC();
-        if (row == BLOCK) load_weights(s, in, THREAD, THREADS);
-        attend(s, in, THREAD, THREADS);
+        load(s, in, row == BLOCK, thread, threads);
+        attend(s, in, thread, threads);
         const float *de = (const float *)a.p[12] + row * a.n[6];
         float *dz = (float *)a.p[13] + row * a.n[7], *du = (float *)a.p[14] + row * a.n[8];
         // The sum before the norm, again.
-        tile(view(s.mix, even, 1), view(s.wo, 1, s.odd), in.bo, 1.0f, d_mix, even, 0, n, m, m, THREAD, THREADS);
+        tile(view(s.mix, even, 1), view(s.wo, 1, s.odd), in.bo, 1.0f, d_mix, even, 0, n, m, m, thread, threads);
         SYNC();
         for (int y = WARP; y < n; y += WARPS) {
             float mean = stats[2 * (row * n + y)], scale = stats[2 * (row * n + y) + 1], sum = 0.0f, product = 0.0f;
@@ -183,10 +221,10 @@ KERNEL(interaction_backward) {
             }
         }
         SYNC();
-        tile(view(d_sum, even, 1), view(s.wo, s.odd, 1), 0, 1.0f, d_mix, even, 0, n, m, m, THREAD, THREADS);
+        tile(view(d_sum, even, 1), view(s.wo, s.odd, 1), 0, 1.0f, d_mix, even, 0, n, m, m, thread, threads);
         SYNC();
-        tile(view(d_mix, even, 1), view(s.v, 1, s.odd), 0, 1.0f, d_map, s.across, 0, n, r, m, THREAD, THREADS);
-        tile(view(s.map, 1, s.across), view(d_mix, even, 1), 0, 1.0f, dv, even, 0, r, m, n, THREAD, THREADS);
+        tile(view(d_mix, even, 1), view(s.v, 1, s.odd), 0, 1.0f, d_map, s.across, 0, n, r, m, thread, threads);
+        tile(view(s.map, 1, s.across), view(d_mix, even, 1), 0, 1.0f, dv, even, 0, r, m, n, TURNED(n / 4 * r), threads);
         SYNC();
         float factor = 1.0f / sqrtf((float)m);
         for (int y = WARP; y < n; y += WARPS) {
@@ -196,13 +234,13 @@ KERNEL(interaction_backward) {
             for (int j = LANE; j < r; j += LANES) d[j] = map[j] * (d[j] - sum) * factor;
         }
         SYNC();
-        tile(view(d_map, s.across, 1), view(s.k, s.odd, 1), 0, 1.0f, dq, even, 0, n, m, r, THREAD, THREADS);
-        tile(view(d_map, 1, s.across), view(s.q, even, 1), 0, 1.0f, dk, even, 0, r, m, n, THREAD, THREADS);
+        tile(view(d_map, s.across, 1), view(s.k, s.odd, 1), 0, 1.0f, dq, even, 0, n, m, r, thread, threads);
+        tile(view(d_map, 1, s.across), view(s.q, even, 1), 0, 1.0f, dk, even, 0, r, m, n, TURNED(n / 4 * m), threads);
         SYNC();
-        tile(view(dq, even, 1), view(s.wq, s.odd, 1), 0, 1.0f, dz, m, 1, n, m, m, THREAD, THREADS);
-        tile(view(dk, even, 1), view(s.wk, s.odd, 1), 0, 1.0f, s.u, even, 0, r, m, m, THREAD, THREADS);
+        tile(view(dq, even, 1), view(s.wq, s.odd, 1), 0, 1.0f, dz, m, 1, n, m, m, thread, threads);
+        tile(view(dk, even, 1), view(s.wk, s.odd, 1), 0, 1.0f, s.u, even, 0, r, m, m, TURNED(n / 4 * m), threads);
         SYNC();
-        tile(view(dv, even, 1), view(s.wv, s.odd, 1), 0, 1.0f, s.u, even, 1, r, m, m, THREAD, THREADS);
+        tile(view(dv, even, 1), view(s.wv, s.odd, 1), 0, 1.0f, s.u, even, 1, r, m, m, thread, threads);
         SYNC();
         for (int i = THREAD; i < n * m; i += THREADS) dz[i] += d_sum[i / m * even + i % m];
         for (int i = THREAD; i < r * m; i += THREADS) du[i] = s.u[i / m * even + i % m];

@@ -5,71 +5,97 @@
 #define ROWS_AT_ONCE 16
 #define COLUMNS_AT_ONCE 4
 
+typedef struct {
+    const float *x, *w;
+    float *y;
+    int m, n, k, of_x, of_w, of_y, add;
+} Product;
+
 #ifdef __CUDACC__
-// The sum over a warp of 64 numbers a lane: lane i ends with numbers 2 i and 2 i + 1.
+// The sums over a warp of 2 h numbers a lane, first step: each lane keeps h of them, the other lane's share added.
 #define HALVE(o, h)                                                                      \
     for (int i = 0; i < h; i++) {                                                        \
         float sent = LANE & o ? sums[i] : sums[i + h], kept = LANE & o ? sums[i + h] : sums[i]; \
         sums[i] = kept + __shfl_xor_sync(0xffffffffu, sent, o);                          \
     }
 
-DEVICE void scatter_sums(float *sums) {
+// The sums over a warp of 32 `each` numbers a lane: lane i ends with numbers `each` i and on.
+DEVICE void scatter_sums(float *sums, const int each) {
 UNROLL
-    HALVE(16, 32)
+    HALVE(16, 16 * each)
 UNROLL
-    HALVE(8, 16)
+    HALVE(8, 8 * each)
 UNROLL
-    HALVE(4, 8)
+    HALVE(4, 4 * each)
 UNROLL
-    HALVE(2, 4)
+    HALVE(2, 2 * each)
 UNROLL
-    HALVE(1, 2)
+    HALVE(1, each)
 }
 #endif
 
-// y [m, n] = x [m, k] w^T, w [n, k], or added to y: 4 columns of 16 rows a block, whose threads share k. k and all strides are multiples of 4.
-// p: x, w, y. n: m, n, k, stride of x, of w, of y, add.
-KERNEL(product_few_rows) {
-    const float *x = (const float *)a.p[0], *w = (const float *)a.p[1];
-    float *y = (float *)a.p[2];
-    int m = a.n[0], n = a.n[1], k = a.n[2], columns = (n + COLUMNS_AT_ONCE - 1) / COLUMNS_AT_ONCE;
-    int first = BLOCK % columns * COLUMNS_AT_ONCE, from = BLOCK / columns * ROWS_AT_ONCE;
-    float sums[ROWS_AT_ONCE * COLUMNS_AT_ONCE];
+// Four columns of `rows` rows (8 or 16) by `shares` warps, which share k; as many fours at a time as a block has warps for.
+DEVICE void few_rows(Product p, const int rows, int shares, int BLOCK, int BLOCKS) {
+    int columns = (p.n + COLUMNS_AT_ONCE - 1) / COLUMNS_AT_ONCE, tasks = columns * ((p.m + rows - 1) / rows);
+    int at_once = WARPS / shares, share = WARP % shares;
+    for (int task = BLOCK * at_once + WARP / shares; task - WARP / shares < tasks; task += BLOCKS * at_once) {
+        int first = task % columns * COLUMNS_AT_ONCE, from = task / columns * rows;
+        float sums[ROWS_AT_ONCE * COLUMNS_AT_ONCE];
 UNROLL
-    for (int i = 0; i < ROWS_AT_ONCE * COLUMNS_AT_ONCE; i++) sums[i] = 0.0f;
-    for (int at = 4 * THREAD; at < k; at += 4 * THREADS) {
-        Four of_w[COLUMNS_AT_ONCE];
+        for (int i = 0; i < rows * COLUMNS_AT_ONCE; i++) sums[i] = 0.0f;
+        if (task < tasks) {
+            const float *of_w[COLUMNS_AT_ONCE];
 UNROLL
-        for (int c = 0; c < COLUMNS_AT_ONCE; c++) {
-            int column = first + c < n ? first + c : n - 1;
-            of_w[c] = *(const Four *)(w + column * a.n[4] + at);
+            for (int c = 0; c < COLUMNS_AT_ONCE; c++) of_w[c] = p.w + (first + c < p.n ? first + c : p.n - 1) * p.of_w;
+            for (int at = 4 * (share * LANES + LANE); at < p.k; at += 4 * LANES * shares) {
+                int of_x = from * p.of_x + at;
+                Four w[COLUMNS_AT_ONCE];
+UNROLL
+                for (int c = 0; c < COLUMNS_AT_ONCE; c++) w[c] = *(const Four *)(of_w[c] + at);
+UNROLL
+                for (int r = 0; r < rows; r++) {
+                    Four x = *(const Four *)(p.x + of_x);
+                    of_x += from + r + 1 < p.m ? p.of_x : 0;
+UNROLL
+                    for (int c = 0; c < COLUMNS_AT_ONCE; c++)
+                        sums[r * COLUMNS_AT_ONCE + c] += x.x * w[c].x + x.y * w[c].y + x.z * w[c].z + x.w * w[c].w;
+                }
+            }
         }
-UNROLL
-        for (int r = 0; r < ROWS_AT_ONCE; r++) {
-            int row = from + r < m ? from + r : m - 1;
-            Four of_x = *(const Four *)(x + row * a.n[3] + at);
-UNROLL
-            for (int c = 0; c < COLUMNS_AT_ONCE; c++)
-                sums[r * COLUMNS_AT_ONCE + c] +=
-                    of_x.x * of_w[c].x + of_x.y * of_w[c].y + of_x.z * of_w[c].z + of_x.w * of_w[c].w;
-        }
-    }
 #ifdef __CUDACC__
-    __shared__ float shares[8][ROWS_AT_ONCE * COLUMNS_AT_ONCE];
-    scatter_sums(sums);
-    shares[WARP][2 * LANE] = sums[0];
-    shares[WARP][2 * LANE + 1] = sums[1];
-    __syncthreads();
-    for (int i = THREAD; i < ROWS_AT_ONCE * COLUMNS_AT_ONCE; i += THREADS) {
-        float sum = 0.0f;
-        for (int share = 0; share < WARPS; share++) sum += shares[share][i];
+        const int each = rows * COLUMNS_AT_ONCE / 32;
+        scatter_sums(sums, each);
+        if (shares > 1) {
+            __shared__ float parts[16][ROWS_AT_ONCE * COLUMNS_AT_ONCE];
+UNROLL
+            for (int i = 0; i < each; i++) parts[WARP][each * LANE + i] = sums[i];
+            __syncthreads();
+            if (share == 0)
+                for (int other = 1; other < shares; other++)
+UNROLL
+                    for (int i = 0; i < each; i++) sums[i] += parts[WARP + other][each * LANE + i];
+            __syncthreads();
+        }
+        if (share > 0 || task >= tasks) continue;
+UNROLL
+        for (int i = 0; i < each; i++) {
+            int row = from + (each * LANE + i) / COLUMNS_AT_ONCE, column = first + (each * LANE + i) % COLUMNS_AT_ONCE;
 #else
-    for (int i = 0; i < ROWS_AT_ONCE * COLUMNS_AT_ONCE; i++) {
-        float sum = sums[i];
+        for (int i = 0; i < rows * COLUMNS_AT_ONCE; i++) {
+            int row = from + i / COLUMNS_AT_ONCE, column = first + i % COLUMNS_AT_ONCE;
 #endif
-        int row = from + i / COLUMNS_AT_ONCE, column = first + i % COLUMNS_AT_ONCE;
-        if (row < m && column < n) put(y + row * a.n[5] + column, a.n[6], sum);
+            if (row < p.m && column < p.n) put(p.y + row * p.of_y + column, p.add, sums[i]);
+        }
     }
+}
+
+// y [m, n] = x [m, k] w^T, w [n, k], or added to y. k and all strides are multiples of 4.
+// p: x, w, y. n: m, n, k, stride of x, of w, of y, add, warps that share k.
+KERNEL(product_few_rows) {
+    Product p = {(const float *)a.p[0], (const float *)a.p[1], (float *)a.p[2], a.n[0], a.n[1], a.n[2], a.n[3], a.n[4], a.n[5], a.n[6]};
+    int shares = LANES == 1 ? 1 : a.n[7];
+    if (p.m <= ROWS_AT_ONCE / 2) few_rows(p, ROWS_AT_ONCE / 2, shares, BLOCK, BLOCKS);
+    else few_rows(p, ROWS_AT_ONCE, shares, BLOCK, BLOCKS);
 }
 
 // y [m, n] = x [m, k] w, w [k, n], or added to y: 32 columns of 16 rows a block, whose warps share k. k and the stride of x are multiples of 4.

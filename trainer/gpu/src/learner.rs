@@ -657,7 +657,8 @@ impl Programs {
             .zip(layouts)
             .map(|(program, (offsets, bytes))| machine.prepare(program.finish(&offsets, bytes, &arena)));
         let mut next = || ready.next().expect("there are as many as were built");
-        Ok(Self { world: next(), masked: next(), judge: next(), behaviour: ready.next() })
+        let (world, masked, judge) = (next()?, next()?, next()?);
+        Ok(Self { world, masked, judge, behaviour: ready.next().transpose()? })
     }
 }
 

@@ -2,6 +2,7 @@
 
 use std::ops::Range;
 
+use crate::lists::Lists;
 use crate::machine::{GpuError, Kernel, Machine};
 
 /// A place in memory.
@@ -163,8 +164,10 @@ pub enum Command {
         /// Factors.
         f: Vec<f32>,
     },
-    /// The other lane goes on only when this one has come here.
-    HandOver,
+    /// Another lane goes on only when this one has come here.
+    HandOver(Lane),
+    /// What one launch runs.
+    Lists(Box<Lists>),
     /// `c = a b + beta c`, row by row: a [m, k] or its transpose, b [k, n] or its transpose.
     Product(Product),
 }
@@ -216,25 +219,16 @@ impl Product {
     }
 }
 
-/// Which of two sequences of commands one belongs to: they run side by side between the points where one hands over to the other.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
+/// Which sequence of commands one belongs to: they run side by side between the points where one hands over to another.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord, Default)]
 pub enum Lane {
     /// Where every program begins and ends.
     #[default]
     Main,
-    /// Beside it.
+    /// Beside it, on the same stream or cluster: as much of both at a time as does not depend on each other.
+    Twin,
+    /// Beside both.
     Side,
-}
-
-impl Lane {
-    /// The other one.
-    #[must_use]
-    pub fn other(self) -> Self {
-        match self {
-            Self::Main => Self::Side,
-            Self::Side => Self::Main,
-        }
-    }
 }
 
 /// A command and where it belongs.
@@ -256,7 +250,7 @@ pub struct Program {
     sizes: Vec<usize>,
     part: u16,
     lane: Lane,
-    /// Where both lanes are in use: what is needed anywhere in such a range is kept for all of it.
+    /// Where all lanes are in use: what is needed anywhere in such a range is kept for all of it.
     forked: Vec<Range<usize>>,
 }
 
@@ -265,6 +259,8 @@ pub struct Program {
 pub struct Finished {
     /// The commands, with fixed places alone.
     pub items: Vec<Item>,
+    /// Which of them lie between a fork and its join, as far as they have not become lists.
+    pub forked: Vec<Range<usize>>,
     /// Names of parts.
     pub parts: Vec<&'static str>,
     /// Memory its buffers take together.
@@ -314,14 +310,14 @@ impl Program {
         self.lane
     }
 
-    /// `from` has come to where the other lane may go on.
-    pub fn hand_over(&mut self, from: Lane) {
+    /// `from` has come to where `to` may go on.
+    pub fn hand_over(&mut self, from: Lane, to: Lane) {
         let before = self.lane(from);
-        self.push(Command::HandOver);
+        self.push(Command::HandOver(to));
         self.lane(before);
     }
 
-    /// Both lanes are in use from here on.
+    /// All lanes are in use from here on.
     pub fn fork(&mut self) {
         self.forked.push(self.items.len()..usize::MAX);
     }
@@ -357,7 +353,7 @@ impl Program {
         match product.with_few_rows() {
             Some((kernel, grid)) => {
                 let Product { a, b, c, add, .. } = product;
-                let n = [m, n, k, a.stride, b.stride, c.stride, usize::from(add)];
+                let n = [m, n, k, a.stride, b.stride, c.stride, usize::from(add), grid.threads / 32];
                 self.kernel(kernel, grid, &[a.into(), b.into(), c.into()], &n, &[]);
             }
             None => self.push(Command::Product(product)),
@@ -429,7 +425,8 @@ impl Program {
         let matrix = |m: Matrix| Matrix { place: fix(m.place), ..m };
         let items = self.items.into_iter().map(|item| {
             let command = match item.command {
-                Command::HandOver => Command::HandOver,
+                Command::HandOver(to) => Command::HandOver(to),
+                Command::Lists(_) => unreachable!("lists are made of finished programs"),
                 Command::Kernel { kernel, grid, p, n, f } => {
                     let p = p.into_iter().map(|p| Pointer { place: p.place.map(fix), ..p }).collect();
                     Command::Kernel { kernel, grid, p, n, f }
@@ -440,7 +437,7 @@ impl Program {
             };
             Item { command, ..item }
         });
-        Finished { items: items.collect(), parts: self.parts, bytes }
+        Finished { items: items.collect(), forked: self.forked, parts: self.parts, bytes }
     }
 }
 
@@ -457,7 +454,7 @@ impl Arena {
 fn each_place(command: &Command, mut look: impl FnMut(Place)) {
     match command {
         Command::Kernel { p, .. } => p.iter().filter_map(|p| p.place).for_each(look),
-        Command::HandOver => (),
+        Command::HandOver(_) | Command::Lists(_) => (),
         Command::Product(p) => [p.a, p.b, p.c].iter().for_each(|m| look(m.place)),
     }
 }

@@ -4,7 +4,7 @@ use rcwm_models::settings::{ModelKind, ModelSettings};
 
 use crate::layers::{Attending, Dense, Draw, Interaction, Linear, Norm, Source, Store, Weight};
 use crate::machine::Kernel;
-use crate::program::{Grid, Matrix, Pointer};
+use crate::program::{Grid, Lane, Matrix, Pointer};
 use crate::tape::Tape;
 
 /// Sizes of a batch and of the model.
@@ -536,7 +536,7 @@ fn scan(
                 let logits = prior.step(tape, at(h_of(0)), here.clone());
                 tape.draw(logits, gumbel(t, 0), at(interaction.prior_z()), draw);
                 tape.copied(at(h_of(0)), at(robot_h));
-                tape.beside(|tape| {
+                tape.beside(Lane::Side, |tape| {
                     carry(tape, 1, interaction.z());
                     interaction.step(tape, at(robot_h), here.clone());
                     rooms[1].step(tape, &branches[1], here.clone(), at(h_of(1)));

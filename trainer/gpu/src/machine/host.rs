@@ -2,7 +2,8 @@
 
 use std::time::Instant;
 
-use super::{Args, PartTime, begin};
+use super::{Args, Kernel, PartTime, begin};
+use crate::lists::{Phase, Task};
 use crate::program::{Command, Finished, Product};
 
 pub(super) type Function = unsafe extern "C" fn(Args, i32, i32);
@@ -19,9 +20,15 @@ pub(super) mod functions {
 #[derive(Debug, Default)]
 pub struct Host {
     memory: Vec<Vec<u64>>,
+    /// Whether second lists run as early as they may, and their phases' tasks from the last to the first: what they compute does not change.
+    in_reverse: bool,
 }
 
 impl Host {
+    pub(super) fn in_reverse() -> Self {
+        Self { in_reverse: true, ..Self::default() }
+    }
+
     pub(super) fn allocate(&mut self, bytes: usize) -> u64 {
         // Poisoned, so that what is read before it is written shows; callers that need zeros upload them.
         let block = vec![0u64; bytes.div_ceil(8)];
@@ -55,7 +62,7 @@ impl Host {
     }
 
     pub(super) fn run(&mut self, program: &Finished) {
-        program.items.iter().for_each(|item| execute(&item.command));
+        program.items.iter().for_each(|item| self.execute(&item.command));
     }
 
     pub(super) fn time_parts(&mut self, program: &Finished) -> Vec<PartTime> {
@@ -63,7 +70,7 @@ impl Host {
             program.parts.iter().map(|part| PartTime { part, commands: 0, ms: 0.0, flops: 0.0 }).collect();
         for item in &program.items {
             let start = Instant::now();
-            execute(&item.command);
+            self.execute(&item.command);
             let time = &mut times[usize::from(item.part)];
             time.ms += 1e3 * start.elapsed().as_secs_f64();
             time.commands += 1;
@@ -76,7 +83,7 @@ impl Host {
 /// Operations of a matrix product; kernels count as none.
 pub(super) fn flops(command: &Command) -> f64 {
     match command {
-        Command::Kernel { .. } | Command::HandOver => 0.0,
+        Command::Kernel { .. } | Command::HandOver(_) | Command::Lists(_) => 0.0,
         Command::Product(product) => {
             let (m, n, k) = product.sizes();
             2.0 * m as f64 * n as f64 * k as f64
@@ -84,19 +91,54 @@ pub(super) fn flops(command: &Command) -> f64 {
     }
 }
 
-fn execute(command: &Command) {
-    match command {
-        Command::Kernel { kernel, grid, p, n, f } => {
-            // Loops over numbers and rows take any number of blocks; where the blocks are what is counted, all of them run.
-            let args = Args::new(p, n, f);
-            let function = kernel.on_host();
-            for block in 0..grid.blocks as i32 {
-                // SAFETY: the arguments are those that the kernel's description names, and its buffers are as large as its counts say.
-                unsafe { function(args, block, grid.blocks as i32) }
+impl Host {
+    fn execute(&self, command: &Command) {
+        match command {
+            Command::Kernel { kernel, grid, p, n, f } => {
+                // Loops over numbers and rows take any number of blocks; where the blocks are what is counted, all of them run.
+                call(*kernel, Args::new(p, n, f), grid.blocks);
             }
+            Command::HandOver(_) => (),
+            Command::Lists(lists) => self.execute_lists(&lists.lists),
+            Command::Product(product) => multiply(product),
         }
-        Command::HandOver => (),
-        Command::Product(product) => multiply(product),
+    }
+
+    /// The first list, then the second; in reverse phases of the second come as soon as they may.
+    fn execute_lists(&self, lists: &[Vec<Phase>]) {
+        let Some((first, rest)) = lists.split_first() else { return };
+        let mut second = rest.iter().flatten().peekable();
+        let mut reached = 0;
+        for phase in first {
+            while self.in_reverse
+                && let Some(next) = second.next_if(|next| next.wait <= reached)
+            {
+                self.execute_phase(next);
+            }
+            self.execute_phase(phase);
+            reached = reached.max(phase.reach);
+        }
+        for next in second {
+            assert!(next.wait <= reached, "a list waits for what never comes");
+            self.execute_phase(next);
+        }
+    }
+
+    fn execute_phase(&self, phase: &Phase) {
+        let run = |task: &Task| call(task.kernel, Args::new(&task.p, &task.n, &task.f), task.blocks.len());
+        if self.in_reverse {
+            phase.tasks.iter().rev().for_each(run);
+        } else {
+            phase.tasks.iter().for_each(run);
+        }
+    }
+}
+
+fn call(kernel: Kernel, args: Args, blocks: usize) {
+    let function = kernel.on_host();
+    for block in 0..blocks as i32 {
+        // SAFETY: the arguments are those that the kernel's description names, and its buffers are as large as its counts say.
+        unsafe { function(args, block, blocks as i32) }
     }
 }
 

@@ -4,6 +4,7 @@ mod host;
 #[cfg(feature = "cuda")]
 mod nvidia;
 
+use crate::lists;
 use crate::program::{Command, Finished};
 
 pub use host::Host;
@@ -43,6 +44,9 @@ pub enum GpuError {
     #[error("{0}")]
     Unsupported(String),
 }
+
+/// Blocks of a cluster that runs a list: the first that the machine has.
+const LIST_WIDTHS: [usize; 2] = [16, 8];
 
 /// Precision of matrix products. Sums, weights and everything else stay f32.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
@@ -105,6 +109,12 @@ impl Machine {
     #[must_use]
     pub fn host() -> Self {
         Self::Host(Host::default())
+    }
+
+    /// The host, which runs what may run in any order in another one than [`Machine::host`].
+    #[must_use]
+    pub fn host_in_reverse() -> Self {
+        Self::Host(Host::in_reverse())
     }
 
     /// The GPU of this number.
@@ -182,13 +192,20 @@ impl Machine {
     }
 
     /// Makes a program ready.
-    #[must_use]
-    pub fn prepare(&self, finished: Finished) -> Ready {
-        Ready {
+    ///
+    /// # Errors
+    /// [`GpuError`] if its lists could not be brought to the machine.
+    pub fn prepare(&mut self, mut finished: Finished) -> Result<Ready, GpuError> {
+        match self {
+            Self::Host(_) => lists::gather(&mut finished, LIST_WIDTHS[0]),
+            #[cfg(feature = "cuda")]
+            Self::Nvidia(gpu) => gpu.prepare(&mut finished)?,
+        }
+        Ok(Ready {
             finished,
             #[cfg(feature = "cuda")]
             graph: None,
-        }
+        })
     }
 
     /// Runs a program; on a GPU it is captured the first time and replayed from then on, and may be under way when this returns.
@@ -235,7 +252,7 @@ impl Ready {
     /// Commands in it: kernels and matrix products.
     #[must_use]
     pub fn commands(&self) -> usize {
-        self.finished.items.iter().filter(|item| item.command != Command::HandOver).count()
+        self.finished.items.iter().filter(|item| !matches!(item.command, Command::HandOver(_))).count()
     }
 
     /// Memory of its buffers.
