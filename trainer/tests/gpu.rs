@@ -201,6 +201,28 @@ fn programs_of_kernels_give_the_losses_gradients_and_weights_of_the_trainers_own
     }
 }
 
+/// Gradients of an update on the host, by name, and how many commands it had.
+fn gradients_on(machine: Machine, kind: ModelKind) -> (BTreeMap<String, Vec<f32>>, usize) {
+    let model = ModelSettings::preset(Preset::Debug, kind);
+    let world = WorldSettings { paint_every: 1, ..WorldSettings::default() };
+    let parameters = lively_parameters(&model);
+    let mut gpu = GpuLearner::new(machine, &plan(&model, &world, None), &parameters).unwrap();
+    gpu.update_world(&batch(ROWS, LENGTH, true, 0), numbered_noise(SEED, 0)).unwrap();
+    let commands = gpu.learner_mut().commands().0;
+    (gradients(&mut gpu), commands)
+}
+
+#[test]
+fn what_a_scan_does_side_by_side_may_be_done_in_any_order() {
+    for kind in [ModelKind::Rcwm, ModelKind::Vanilla] {
+        let (found, commands) = gradients_on(Machine::host(), kind);
+        let (in_reverse, _) = gradients_on(Machine::host_in_reverse(), kind);
+        assert_eq!(found, in_reverse);
+        println!("{kind:?}: {commands} commands");
+        assert!(commands < 400, "the scan is not one launch each way: {commands} commands");
+    }
+}
+
 #[test]
 fn programs_give_the_authors_numbers() {
     let file = std::path::Path::new(env!("CARGO_MANIFEST_DIR")).join("../tests/data/rcwm-small.safetensors");
