@@ -118,12 +118,12 @@ KERNEL(sum_partials) {
     }
 }
 
-// The recurrent cell: LayerNorm of `pre` [rows, 3d], gates, h'. p: pre, gain, shift, h, next, stats.
-// n: rows, d, stride of pre, of h, of next, wide. f: eps.
+// The recurrent cell: LayerNorm of `pre` [rows, 3d], gates, h'. p: pre, gain, shift, h, next, stats, next again (or null).
+// n: rows, d, stride of pre, of h, of next, wide, stride of next again. f: eps.
 KERNEL(cell_forward) {
     const float *pre = (const float *)a.p[0], *gain = (const float *)a.p[1], *shift = (const float *)a.p[2];
     const float *h = (const float *)a.p[3];
-    float *next = (float *)a.p[4], *stats = (float *)a.p[5];
+    float *next = (float *)a.p[4], *stats = (float *)a.p[5], *again = (float *)a.p[6];
     int d = a.n[1], width = 3 * d;
     Team t = team(a.n[5]);
     for (int r = t.first; r < a.n[0]; r += t.step) {
@@ -137,8 +137,9 @@ KERNEL(cell_forward) {
             float reset = sigmoid_of((x[j] - mean) * scale * gain[j] + shift[j]);
             float cand = tanhf(reset * ((x[d + j] - mean) * scale * gain[d + j] + shift[d + j]));
             float update = sigmoid_of((x[2 * d + j] - mean) * scale * gain[2 * d + j] + shift[2 * d + j] - 1.0f);
-            float before = h[r * a.n[3] + j];
-            next[r * a.n[4] + j] = before + update * (cand - before);
+            float before = h[r * a.n[3] + j], after = before + update * (cand - before);
+            next[r * a.n[4] + j] = after;
+            if (again) again[r * a.n[6] + j] = after;
         }
         if (t.lane == 0) {
             stats[2 * r] = mean;
@@ -147,12 +148,13 @@ KERNEL(cell_forward) {
     }
 }
 
-// p: pre, gain, shift, h, stats, d_next, d_gates (after the LayerNorm), d_pre, d_h (added to).
-// n: rows, d, stride of pre, of h, of d_next, of d_h, wide.
+// p: pre, gain, shift, h, stats, d_next, d_gates (after the LayerNorm), d_pre, d_h (added to), d_next again (or null).
+// n: rows, d, stride of pre, of h, of d_next, of d_h, wide, stride of d_next again.
 KERNEL(cell_backward) {
     const float *pre = (const float *)a.p[0], *gain = (const float *)a.p[1], *shift = (const float *)a.p[2];
     const float *h = (const float *)a.p[3], *stats = (const float *)a.p[4], *d_next = (const float *)a.p[5];
     float *d_gates = (float *)a.p[6], *d_pre = (float *)a.p[7], *d_h = (float *)a.p[8];
+    const float *again = (const float *)a.p[9];
     int d = a.n[1], width = 3 * d;
     Team t = team(a.n[6]);
     for (int r = t.first; r < a.n[0]; r += t.step) {
@@ -164,6 +166,7 @@ KERNEL(cell_backward) {
             float reset = sigmoid_of(n0 * gain[j] + shift[j]), z1 = n1 * gain[d + j] + shift[d + j];
             float cand = tanhf(reset * z1), update = sigmoid_of(n2 * gain[2 * d + j] + shift[2 * d + j] - 1.0f);
             float before = h[r * a.n[3] + j], dy = d_next[r * a.n[4] + j];
+            if (again) dy += again[r * a.n[7] + j];
             float d_arg = dy * update * (1.0f - cand * cand);
             float d0 = d_arg * z1 * reset * (1.0f - reset), d1 = d_arg * reset;
             float d2 = dy * (cand - before) * update * (1.0f - update);

@@ -205,7 +205,8 @@ fn rollout(
                 interaction.step(tape, to(column(0, 1)), here.clone());
             }
             tape.copied(at(h), at(rooms[branch].before()));
-            rooms[branch].step(tape, layers, here.clone(), to(h));
+            let reached = rooms[branch].input.cols;
+            rooms[branch].step(tape, layers, here.clone(), reached, (to(h), None));
             let logits = priors[branch].step(tape, to(h), here.clone());
             let gumbel = next_noise(tape, nm, false);
             tape.draw(logits, gumbel, to(z), draw);

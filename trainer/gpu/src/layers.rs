@@ -319,8 +319,8 @@ impl Tape {
         self.add_partials(partial.pointer(), shift, chunks, 2 * x.cols, x.cols);
     }
 
-    /// The recurrent cell of some of the rows: h' from its layer's output `pre` [rows, 3d] and h. `gates` [rows, 3d] takes the gradients after
-    /// the norm.
+    /// The recurrent cell of some of the rows: h' from its layer's output `pre` [rows, 3d] and h, to one or two places whose gradients are added.
+    /// `gates` [rows, 3d] takes the gradients after the norm.
     pub fn cell_step(
         &mut self,
         pre: Matrix,
@@ -328,19 +328,24 @@ impl Tape {
         stats: Matrix,
         gates: Matrix,
         h: Matrix,
-        next: Matrix,
+        (next, again): (Matrix, Option<Matrix>),
     ) {
+        let stride = |again: Option<Matrix>| again.map_or(0, |again| again.stride);
         let (grid, wide) = Grid::rows(pre.rows, pre.cols);
         let p = [pre, norm.gain.value, norm.shift.value, h, next, stats].map(Pointer::from);
-        let n = [pre.rows, h.cols, pre.stride, h.stride, next.stride, usize::from(wide)];
+        let p = [&p[..], &[again.into()]].concat();
+        let n = [pre.rows, h.cols, pre.stride, h.stride, next.stride, usize::from(wide), stride(again)];
         self.program.kernel(Kernel::CellForward, grid, &p, &n, &[norm.eps]);
         self.on_backward(move |tape| {
             let d_next = tape.gradient_of(next);
+            let d_again = again.map(|again| tape.gradient_of(again));
             let d_pre = tape.gradient_overwritten(pre);
             let dh = tape.gradient_sum(h);
             let p = [pre, norm.gain.value, norm.shift.value, h, stats, d_next, gates, d_pre, dh]
                 .map(Pointer::from);
-            let n = [pre.rows, h.cols, pre.stride, h.stride, d_next.stride, dh.stride, usize::from(wide)];
+            let p = [&p[..], &[d_again.into()]].concat();
+            let strides = [pre.stride, h.stride, d_next.stride, dh.stride];
+            let n = [&[pre.rows, h.cols][..], &strides, &[usize::from(wide), stride(d_again)]].concat();
             tape.program.kernel(Kernel::CellBackward, grid, &p, &n, &[]);
         });
     }

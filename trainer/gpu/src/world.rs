@@ -230,12 +230,20 @@ impl Recurrence {
         self.joined.columns(self.hidden..self.joined.cols)
     }
 
-    /// h_t of some rows (eq. 5, 6).
-    pub fn step(&self, tape: &mut Tape, branch: &Branch, rows: std::ops::Range<usize>, h: Matrix) {
+    /// h_t of some rows (eq. 5, 6), to one or two places. Gradients reach the first `reached` columns of the input.
+    pub fn step(
+        &self,
+        tape: &mut Tape,
+        branch: &Branch,
+        rows: std::ops::Range<usize>,
+        reached: usize,
+        h: (Matrix, Option<Matrix>),
+    ) {
         let at = |matrix: Matrix| matrix.rows(rows.clone());
         let x = at(self.joined.columns(0..self.hidden));
         tape.linear(at(self.input), branch.input.weight, at(self.pre), false);
-        tape.linear_back(at(self.input), branch.input.weight, at(self.pre));
+        let weight = branch.input.weight.columns(0..reached);
+        tape.linear_back(at(self.input.columns(0..reached)), weight, at(self.pre));
         tape.norm_step(at(self.pre), branch.input.norm, at(self.stats), x, true);
         tape.linear(at(self.joined), branch.cell, at(self.cell), false);
         tape.linear_back(at(self.joined), branch.cell, at(self.cell));
@@ -517,7 +525,7 @@ fn scan(
     let actions = Matrix::fixed(inputs.action, rows, sizes.model.action);
     tape.copy(actions, rooms[0].input.columns(nm..nm + sizes.model.action), false, 1.0);
 
-    // What the environment's lane sees of the robot has gradients of its own: each lane adds to its own.
+    // What the other lanes see of the robot has gradients of its own: they do not add to what its lane adds to.
     let robot_h = interaction.map(|_| tape.matrix(rows, sizes.model.deter));
     tape.forked(|tape| {
         for t in 0..sizes.length {
@@ -531,17 +539,18 @@ fn scan(
                 tape.carry(first, [z_0, h_0], before, [at(z), at(rooms[branch].before())]);
             };
             carry(tape, 0, rooms[0].input.columns(0..nm));
-            rooms[0].step(tape, &branches[0], here.clone(), at(h_of(0)));
+            rooms[0].step(tape, &branches[0], here.clone(), nm, (at(h_of(0)), robot_h.map(at)));
             if let (Some((prior, interaction)), Some(robot_h)) = (&interaction, robot_h) {
-                let logits = prior.step(tape, at(h_of(0)), here.clone());
-                tape.draw(logits, gumbel(t, 0), at(interaction.prior_z()), draw);
-                tape.copied(at(h_of(0)), at(robot_h));
-                tape.beside(Lane::Side, |tape| {
-                    carry(tape, 1, interaction.z());
-                    interaction.step(tape, at(robot_h), here.clone());
-                    rooms[1].step(tape, &branches[1], here.clone(), at(h_of(1)));
-                    let logits = posteriors[1].step(tape, at(h_of(1)), here.clone());
-                    tape.draw(logits, gumbel(t, 2), at(z_of(1)), draw);
+                tape.beside(Lane::Twin, |tape| {
+                    let logits = prior.step(tape, at(robot_h), here.clone());
+                    tape.draw(logits, gumbel(t, 0), at(interaction.prior_z()), draw);
+                    tape.beside(Lane::Side, |tape| {
+                        carry(tape, 1, interaction.z());
+                        interaction.step(tape, at(robot_h), here.clone());
+                        rooms[1].step(tape, &branches[1], here.clone(), nm, (at(h_of(1)), None));
+                        let logits = posteriors[1].step(tape, at(h_of(1)), here.clone());
+                        tape.draw(logits, gumbel(t, 2), at(z_of(1)), draw);
+                    });
                 });
             }
             let logits = posteriors[0].step(tape, at(h_of(0)), here.clone());
