@@ -658,7 +658,13 @@ impl Programs {
             .map(|(program, (offsets, bytes))| machine.prepare(program.finish(&offsets, bytes, &arena)));
         let mut next = || ready.next().expect("there are as many as were built");
         let (world, masked, judge) = (next()?, next()?, next()?);
-        Ok(Self { world, masked, judge, behaviour: ready.next().transpose()? })
+        let mut made = Self { world, masked, judge, behaviour: ready.next().transpose()? };
+        for program in
+            [&mut made.world, &mut made.masked, &mut made.judge].into_iter().chain(&mut made.behaviour)
+        {
+            machine.capture(program)?;
+        }
+        Ok(made)
     }
 }
 

@@ -208,6 +208,19 @@ impl Machine {
         })
     }
 
+    /// Captures a program on a GPU, so that its first run costs what every run does.
+    ///
+    /// # Errors
+    /// [`GpuError::Failed`].
+    pub fn capture(&mut self, program: &mut Ready) -> Result<(), GpuError> {
+        #[cfg(feature = "cuda")]
+        if let Self::Nvidia(gpu) = self {
+            program.graph = gpu.capture(&program.finished)?;
+        }
+        let _ = program;
+        Ok(())
+    }
+
     /// Runs a program; on a GPU it is captured the first time and replayed from then on, and may be under way when this returns.
     ///
     /// # Errors

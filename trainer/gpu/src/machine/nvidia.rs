@@ -5,7 +5,7 @@ mod lists;
 use std::collections::HashMap;
 use std::ffi::c_void;
 use std::panic::{AssertUnwindSafe, catch_unwind};
-use std::sync::Arc;
+use std::sync::{Arc, Mutex, PoisonError};
 
 use cudarc::cublas::{CudaBlas, result as blas, sys as blas_sys};
 use cudarc::driver::{
@@ -201,19 +201,26 @@ impl Nvidia {
 
     pub(super) fn run(&mut self, program: &Finished, graph: &mut Option<Graph>) -> Result<(), GpuError> {
         if graph.is_none() {
-            self.stream.synchronize().map_err(failed("waiting"))?;
-            let mode = sys::CUstreamCaptureMode::CU_STREAM_CAPTURE_MODE_THREAD_LOCAL;
-            self.stream.begin_capture(mode).map_err(failed("beginning a capture"))?;
-            let captured = program.items.iter().try_for_each(|item| self.execute(&item.command, item.lane));
-            let made = self.stream.end_capture(sys::CUgraphInstantiate_flags(0));
-            captured?;
-            let made = made.map_err(failed("capturing a program"))?;
-            *graph = made.map(Graph);
+            *graph = self.capture(program)?;
         }
         match graph {
             Some(graph) => graph.0.launch().map_err(failed("launching a program")),
             None => Ok(()),
         }
+    }
+
+    /// A program as a graph.
+    pub(super) fn capture(&mut self, program: &Finished) -> Result<Option<Graph>, GpuError> {
+        // Libraries load their kernels when they are first used, which no other capture may meet: one at a time.
+        static ONE: Mutex<()> = Mutex::new(());
+        let _one = ONE.lock().unwrap_or_else(PoisonError::into_inner);
+        self.stream.synchronize().map_err(failed("waiting"))?;
+        let mode = sys::CUstreamCaptureMode::CU_STREAM_CAPTURE_MODE_RELAXED;
+        self.stream.begin_capture(mode).map_err(failed("beginning a capture"))?;
+        let captured = program.items.iter().try_for_each(|item| self.execute(&item.command, item.lane));
+        let made = self.stream.end_capture(sys::CUgraphInstantiate_flags(0));
+        captured?;
+        Ok(made.map_err(failed("capturing a program"))?.map(Graph))
     }
 
     pub(super) fn time_parts(&mut self, program: &Finished) -> Result<Vec<PartTime>, GpuError> {
