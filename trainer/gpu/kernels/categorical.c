@@ -8,8 +8,10 @@ typedef struct {
 DEVICE Softmax softmax_of(const float *x, int classes, int lane, int lanes) {
     Softmax s;
     float largest = x[lane < classes ? lane : 0], sum = 0.0f;
+NO_UNROLL
     for (int j = lane; j < classes; j += lanes) largest = fmaxf(largest, x[j]);
     s.largest = warp_max(largest);
+NO_UNROLL
     for (int j = lane; j < classes; j += lanes) sum += expf(x[j] - s.largest);
     s.sum = warp_sum(sum);
     return s;
@@ -30,6 +32,7 @@ KERNEL(draw) {
         Softmax s = softmax_of(x, m, t.lane, t.lanes);
         float best = -INFINITY;
         int index = 0x7fffffff;
+NO_UNROLL
         for (int j = t.lane; j < m; j += t.lanes) {
             float p = (1.0f - a.f[0]) * (expf(x[j] - s.largest) / s.sum) + a.f[0] / (float)m;
             float score = noise ? logf(p) + noise[j] : p;
@@ -39,6 +42,7 @@ KERNEL(draw) {
             }
         }
         index = warp_best(best, index);
+NO_UNROLL
         for (int j = t.lane; j < m; j += t.lanes) z[row * a.n[4] + at + j] = j == index ? 1.0f : 0.0f;
     }
 }
@@ -55,11 +59,13 @@ KERNEL(draw_backward) {
         const float *x = logits + row * a.n[3] + at, *d = dz + row * a.n[4] + at;
         Softmax s = softmax_of(x, m, t.lane, t.lanes);
         float sum = 0.0f;
+NO_UNROLL
         for (int j = t.lane; j < m; j += t.lanes) {
             float y = expf(x[j] - s.largest) / s.sum, p = (1.0f - a.f[0]) * y + a.f[0] / (float)m;
             sum += y * (a.n[6] ? d[j] / p : d[j]);
         }
         sum = warp_sum(sum);
+NO_UNROLL
         for (int j = t.lane; j < m; j += t.lanes) {
             float y = expf(x[j] - s.largest) / s.sum, p = (1.0f - a.f[0]) * y + a.f[0] / (float)m;
             put(dx + row * a.n[5] + at + j, a.n[7], (1.0f - a.f[0]) * y * ((a.n[6] ? d[j] / p : d[j]) - sum));

@@ -23,22 +23,31 @@ typedef unsigned char u8;
     extern "C" __global__ void name(const __grid_constant__ Args a) { name##_in(a, (int)blockIdx.x, (int)gridDim.x); } \
     DEVICE void name##_in(const Args &a, int BLOCK, int BLOCKS)
 #define DEVICE static __device__ __forceinline__
+// A function of its own: what is called from many places and runs a few times from each would take long to load as instructions.
+#define DEVICE_CALL static __device__ __noinline__
+#define IN_SHARED(at) __builtin_assume(__isShared(at))
 #define THREAD ((int)threadIdx.x)
 #define THREADS ((int)blockDim.x)
 #define LANES 32
 #define SYNC() __syncthreads()
 #define UNROLL _Pragma("unroll")
+#define UNROLL_TWICE _Pragma("unroll 2")
+#define NO_UNROLL _Pragma("unroll 1")
 #define SHARED(name) extern __shared__ float name[]
 #define INFINITY __int_as_float(0x7f800000)
 #else
 #include <math.h>
 #define KERNEL(name) void name(Args a, int BLOCK, int BLOCKS)
 #define DEVICE static inline
+#define DEVICE_CALL static inline
+#define IN_SHARED(at)
 #define THREAD 0
 #define THREADS 1
 #define LANES 1
 #define SYNC()
 #define UNROLL
+#define UNROLL_TWICE
+#define NO_UNROLL
 #define SHARED(name) static float name[1 << 17]
 
 #endif

@@ -1,6 +1,6 @@
 #include "common.h"
 
-// out [rows, cols] = scale * (A B) + bias, or added to out, by a block: A(i, k) = a[i ar + k ac], B(k, j) = b[k br + j bc]. Rows and depth are
+// out [rows, cols] = scale * (A B) + bias, or added to out, by a block, all of it in shared memory but the bias: A(i, k) = a[i ar + k ac], B(k, j) = b[k br + j bc]. Rows and depth are
 // multiples of 4; a thread does four rows of a column. Arrays that are read as A have a pitch that is a multiple of 4, those that are read as B
 // along k an odd one, which spreads them over the banks. Products that do not wait for each other begin at different threads (`TURNED`), so
 // that those without work in one have some in the next.
@@ -9,13 +9,18 @@ typedef struct {
     int row, column;
 } View;
 
-DEVICE void tile(View a, View b, const float *bias, float scale, float *out, int pitch, int add, int rows, int cols, int depth,
-                 int thread, int threads) {
+DEVICE_CALL void tile(View a, View b, const float *bias, float scale, float *out, int pitch, int add, int rows, int cols, int depth,
+                      int thread, int threads) {
+    IN_SHARED(a.at);
+    IN_SHARED(b.at);
+    IN_SHARED(out);
+NO_UNROLL
     for (int item = thread; item < rows / 4 * cols; item += threads) {
         int j = item % cols, i = item / cols * 4;
         const float *x = a.at + i * a.row, *y = b.at + j * b.column;
         float s0 = 0.0f, s1 = 0.0f, s2 = 0.0f, s3 = 0.0f;
         if (a.column == 1) {
+UNROLL_TWICE
             for (int k = 0; k < depth; k += 4) {
                 Four x0 = *(const Four *)(x + k), x1 = *(const Four *)(x + a.row + k);
                 Four x2 = *(const Four *)(x + 2 * a.row + k), x3 = *(const Four *)(x + 3 * a.row + k);
@@ -27,6 +32,7 @@ DEVICE void tile(View a, View b, const float *bias, float scale, float *out, int
             }
         } else {
             // Rows follow each other: four at once.
+UNROLL_TWICE
             for (int k = 0; k < depth; k++) {
                 Four xk = *(const Four *)(x + k * a.column);
                 float yk = y[k * b.row];
@@ -237,12 +243,12 @@ KERNEL(interaction_backward) {
         tile(view(d_map, s.across, 1), view(s.k, s.odd, 1), 0, 1.0f, dq, even, 0, n, m, r, thread, threads);
         tile(view(d_map, 1, s.across), view(s.q, even, 1), 0, 1.0f, dk, even, 0, r, m, n, TURNED(n / 4 * m), threads);
         SYNC();
-        tile(view(dq, even, 1), view(s.wq, s.odd, 1), 0, 1.0f, dz, m, 1, n, m, m, thread, threads);
+        tile(view(dq, even, 1), view(s.wq, s.odd, 1), 0, 1.0f, s.z, even, 0, n, m, m, thread, threads);
         tile(view(dk, even, 1), view(s.wk, s.odd, 1), 0, 1.0f, s.u, even, 0, r, m, m, TURNED(n / 4 * m), threads);
         SYNC();
         tile(view(dv, even, 1), view(s.wv, s.odd, 1), 0, 1.0f, s.u, even, 1, r, m, m, thread, threads);
         SYNC();
-        for (int i = THREAD; i < n * m; i += THREADS) dz[i] += d_sum[i / m * even + i % m];
+        for (int i = THREAD; i < n * m; i += THREADS) dz[i] += d_sum[i / m * even + i % m] + s.z[i / m * even + i % m];
         for (int i = THREAD; i < r * m; i += THREADS) du[i] = s.u[i / m * even + i % m];
         if (a.p[15]) {
             float *store = (float *)a.p[15];
