@@ -20,8 +20,8 @@ NO_UNROLL
 // One-hot draws from categoricals: argmax of log p + noise, p with its uniform share; without noise (p[1] null) the mode.
 // p: logits, gumbel, z. n: rows, categoricals, classes, stride of logits, of z, T, B: noise of row t * B + b is that of b * T + t. f: unimix.
 KERNEL(draw) {
-    const float *logits = (const float *)a.p[0], *gumbel = (const float *)a.p[1];
-    float *z = (float *)a.p[2];
+    const float *logits = (const float *)AT(0), *gumbel = (const float *)AT(1);
+    float *z = (float *)AT(2);
     int n = a.n[1], m = a.n[2];
     Team t = team(0);
     for (int g = t.first; g < a.n[0] * n; g += t.step) {
@@ -50,8 +50,8 @@ NO_UNROLL
 // The straight-through gradient: dz reaches p (of a draw), or log p (of a mode, n[6]).
 // p: logits, dz, d_logits. n: rows, categoricals, classes, stride of logits, of dz, of d_logits, of a mode, add. f: unimix.
 KERNEL(draw_backward) {
-    const float *logits = (const float *)a.p[0], *dz = (const float *)a.p[1];
-    float *dx = (float *)a.p[2];
+    const float *logits = (const float *)AT(0), *dz = (const float *)AT(1);
+    float *dx = (float *)AT(2);
     int n = a.n[1], m = a.n[2];
     Team t = team(0);
     for (int g = t.first; g < a.n[0] * n; g += t.step) {
@@ -78,8 +78,8 @@ NO_UNROLL
 // p: q logits, p logits, kl [rows], d_q, d_p. n: rows, categoricals, classes, stride of q, of p, of d_q, of d_p.
 // f: unimix, free, prior_scale * weight, posterior_scale * weight.
 KERNEL(balanced_kl) {
-    const float *q = (const float *)a.p[0], *p = (const float *)a.p[1];
-    float *kl = (float *)a.p[2], *dq = (float *)a.p[3], *dp = (float *)a.p[4];
+    const float *q = (const float *)AT(0), *p = (const float *)AT(1);
+    float *kl = (float *)AT(2), *dq = (float *)AT(3), *dp = (float *)AT(4);
     int n = a.n[1], m = a.n[2];
     float share = 1.0f - a.f[0], mixed = a.f[0] / (float)m;
     Team t = team(0);

@@ -26,6 +26,7 @@ typedef unsigned char u8;
 // A function of its own: what is called from many places and runs a few times from each would take long to load as instructions.
 #define DEVICE_CALL static __device__ __noinline__
 #define IN_SHARED(at) __builtin_assume(__isShared(at))
+#define AT(i) in_global(a.p[i])
 #define THREAD ((int)threadIdx.x)
 #define THREADS ((int)blockDim.x)
 #define LANES 32
@@ -41,6 +42,7 @@ typedef unsigned char u8;
 #define DEVICE static inline
 #define DEVICE_CALL static inline
 #define IN_SHARED(at)
+#define AT(i) (a.p[i])
 #define THREAD 0
 #define THREADS 1
 #define LANES 1
@@ -58,6 +60,14 @@ typedef float4 Four;
 typedef struct {
     float x, y, z, w;
 } Four;
+#endif
+
+#ifdef __CUDACC__
+// An address that kernels are given, also where the compiler does not see by whom.
+DEVICE void *in_global(void *at) {
+    __builtin_assume(__isGlobal(at));
+    return at;
+}
 #endif
 
 #define LANE (THREAD % LANES)

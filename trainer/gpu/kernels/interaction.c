@@ -149,8 +149,8 @@ DEVICE void attend(Work s, Inputs in, int thread, int threads) {
 }
 
 #define INPUTS(z_stride, u_stride)                                                                                             \
-    {(const float *)a.p[0] + row * (z_stride), (const float *)a.p[1] + row * (u_stride), (const float *)a.p[2], (const float *)a.p[3], \
-     (const float *)a.p[4], (const float *)a.p[5], (const float *)a.p[6], (const float *)a.p[7], (const float *)a.p[8], (const float *)a.p[9]}
+    {(const float *)AT(0) + row * (z_stride), (const float *)AT(1) + row * (u_stride), (const float *)AT(2), (const float *)AT(3), \
+     (const float *)AT(4), (const float *)AT(5), (const float *)AT(6), (const float *)AT(7), (const float *)AT(8), (const float *)AT(9)}
 
 // The interaction (eq. 7, A.2) of one row of the batch a block: e = LayerNorm(z + W_o softmax(q k^T / sqrt(m)) v + b_o).
 // p: z [rows, n m], u [rows, (n+k) m], wq, bq, wk, bk, wv, bv, wo, bo, gain, shift, e, mix (or null), sum before the norm (or null), stats.
@@ -158,16 +158,16 @@ DEVICE void attend(Work s, Inputs in, int thread, int threads) {
 KERNEL(interaction_forward) {
     SHARED(shared);
     Work s = layout(shared, a.n[1], a.n[2], a.n[3]);
-    const float *gain = (const float *)a.p[10], *shift = (const float *)a.p[11];
+    const float *gain = (const float *)AT(10), *shift = (const float *)AT(11);
     int thread = THREAD, threads = THREADS;
     for (int row = BLOCK; row < a.n[0]; row += BLOCKS) {
         Inputs in = INPUTS(a.n[4], a.n[5]);
         SYNC();
         load(s, in, row == BLOCK, thread, threads);
         attend(s, in, thread, threads);
-        if (a.p[13])
+        if (AT(13))
             for (int i = THREAD; i < s.n * s.m; i += THREADS)
-                ((float *)a.p[13])[row * s.n * s.m + i] = s.mix[i / s.m * s.even + i % s.m];
+                ((float *)AT(13))[row * s.n * s.m + i] = s.mix[i / s.m * s.even + i % s.m];
         // z becomes the sum before the norm.
         tile(view(s.mix, s.even, 1), view(s.wo, 1, s.odd), in.bo, 1.0f, s.z, s.even, 1, s.n, s.m, s.m, thread, threads);
         SYNC();
@@ -179,11 +179,11 @@ KERNEL(interaction_forward) {
             for (int j = LANE; j < s.m; j += LANES) squares += (x[j] - mean) * (x[j] - mean);
             float scale = 1.0f / sqrtf(warp_sum(squares) / (float)s.m + a.f[0]);
             for (int j = LANE; j < s.m; j += LANES) {
-                if (a.p[14]) ((float *)a.p[14])[(row * s.n + y) * s.m + j] = x[j];
-                ((float *)a.p[12])[row * a.n[6] + y * s.m + j] = (x[j] - mean) * scale * gain[j] + shift[j];
+                if (AT(14)) ((float *)AT(14))[(row * s.n + y) * s.m + j] = x[j];
+                ((float *)AT(12))[row * a.n[6] + y * s.m + j] = (x[j] - mean) * scale * gain[j] + shift[j];
             }
             if (LANE == 0) {
-                float *stats = (float *)a.p[15] + 2 * (row * s.n + y);
+                float *stats = (float *)AT(15) + 2 * (row * s.n + y);
                 stats[0] = mean;
                 stats[1] = scale;
             }
@@ -200,15 +200,15 @@ KERNEL(interaction_backward) {
     int n = s.n, r = s.r, m = s.m, even = s.even;
     float *d_sum = s.end, *d_mix = d_sum + n * even, *d_map = d_mix + n * even, *dq = d_map + n * s.across;
     float *dk = dq + n * even, *dv = dk + r * even;
-    const float *gain = (const float *)a.p[10], *stats = (const float *)a.p[11];
+    const float *gain = (const float *)AT(10), *stats = (const float *)AT(11);
     int thread = THREAD, threads = THREADS;
     for (int row = BLOCK; row < a.n[0]; row += BLOCKS) {
         Inputs in = INPUTS(a.n[4], a.n[5]);
         SYNC();
         load(s, in, row == BLOCK, thread, threads);
         attend(s, in, thread, threads);
-        const float *de = (const float *)a.p[12] + row * a.n[6];
-        float *dz = (float *)a.p[13] + row * a.n[7], *du = (float *)a.p[14] + row * a.n[8];
+        const float *de = (const float *)AT(12) + row * a.n[6];
+        float *dz = (float *)AT(13) + row * a.n[7], *du = (float *)AT(14) + row * a.n[8];
         // The sum before the norm, again.
         tile(view(s.mix, even, 1), view(s.wo, 1, s.odd), in.bo, 1.0f, d_mix, even, 0, n, m, m, thread, threads);
         SYNC();
@@ -250,8 +250,8 @@ KERNEL(interaction_backward) {
         SYNC();
         for (int i = THREAD; i < n * m; i += THREADS) dz[i] += d_sum[i / m * even + i % m] + s.z[i / m * even + i % m];
         for (int i = THREAD; i < r * m; i += THREADS) du[i] = s.u[i / m * even + i % m];
-        if (a.p[15]) {
-            float *store = (float *)a.p[15];
+        if (AT(15)) {
+            float *store = (float *)AT(15);
             for (int i = THREAD; i < n * m; i += THREADS) {
                 store[row * n * m + i] = d_sum[i / m * even + i % m];
                 store[a.n[9] + row * n * m + i] = dq[i / m * even + i % m];

@@ -3,8 +3,8 @@
 // LayerNorm over a row, then SiLU where n[4]: y = silu((x - mean) / sqrt(var + eps) * gain + shift).
 // p: x, gain, shift, y, stats [rows, 2] (mean, 1 / sqrt(var + eps)). n: rows, width, stride of x, stride of y, silu, wide. f: eps.
 KERNEL(norm_forward) {
-    const float *x = (const float *)a.p[0], *gain = (const float *)a.p[1], *shift = (const float *)a.p[2];
-    float *y = (float *)a.p[3], *stats = (float *)a.p[4];
+    const float *x = (const float *)AT(0), *gain = (const float *)AT(1), *shift = (const float *)AT(2);
+    float *y = (float *)AT(3), *stats = (float *)AT(4);
     int rows = a.n[0], width = a.n[1];
     Team t = team(a.n[5]);
     for (int r = t.first; r < rows; r += t.step) {
@@ -34,9 +34,9 @@ DEVICE float through_silu(float z, float d) {
 
 // p: x, gain, shift, stats, dy, dx. n: rows, width, stride of x, of dy, of dx, silu, add to dx, wide.
 KERNEL(norm_backward) {
-    const float *x = (const float *)a.p[0], *gain = (const float *)a.p[1], *shift = (const float *)a.p[2];
-    const float *stats = (const float *)a.p[3], *dy = (const float *)a.p[4];
-    float *dx = (float *)a.p[5];
+    const float *x = (const float *)AT(0), *gain = (const float *)AT(1), *shift = (const float *)AT(2);
+    const float *stats = (const float *)AT(3), *dy = (const float *)AT(4);
+    float *dx = (float *)AT(5);
     int rows = a.n[0], width = a.n[1];
     Team t = team(a.n[7]);
     for (int r = t.first; r < rows; r += t.step) {
@@ -62,9 +62,9 @@ KERNEL(norm_backward) {
 // Gradients of gain and shift over a chunk of rows: partial [chunks, 2, width].
 // p: x, gain, shift, stats, dy, partial. n: rows, width, stride of x, of dy, silu, rows a chunk.
 KERNEL(norm_parameters) {
-    const float *x = (const float *)a.p[0], *gain = (const float *)a.p[1], *shift = (const float *)a.p[2];
-    const float *stats = (const float *)a.p[3], *dy = (const float *)a.p[4];
-    float *partial = (float *)a.p[5];
+    const float *x = (const float *)AT(0), *gain = (const float *)AT(1), *shift = (const float *)AT(2);
+    const float *stats = (const float *)AT(3), *dy = (const float *)AT(4);
+    float *partial = (float *)AT(5);
     int width = a.n[1], blocks = (width + 31) / 32, chunk = BLOCK / blocks, end = (chunk + 1) * a.n[5];
     if (end > a.n[0]) end = a.n[0];
     for (int lane = LANE; lane < 32; lane += LANES) {
@@ -90,8 +90,8 @@ KERNEL(norm_parameters) {
 // Sums of columns over a chunk of rows: partial [chunks, width].
 // p: x, partial. n: rows, width, stride of x, rows a chunk.
 KERNEL(column_sums) {
-    const float *x = (const float *)a.p[0];
-    float *partial = (float *)a.p[1];
+    const float *x = (const float *)AT(0);
+    float *partial = (float *)AT(1);
     int width = a.n[1], blocks = (width + 31) / 32, chunk = BLOCK / blocks, end = (chunk + 1) * a.n[3];
     if (end > a.n[0]) end = a.n[0];
     for (int lane = LANE; lane < 32; lane += LANES) {
@@ -106,8 +106,8 @@ KERNEL(column_sums) {
 
 // Adds the chunks' shares to a gradient: p: partial, out. n: chunks, width, distance of chunks, offset in a chunk.
 KERNEL(sum_partials) {
-    const float *partial = (const float *)a.p[0];
-    float *out = (float *)a.p[1];
+    const float *partial = (const float *)AT(0);
+    float *out = (float *)AT(1);
     for (int lane = LANE; lane < 32; lane += LANES) {
         int j = BLOCK * 32 + lane;
         float sum = 0.0f;
@@ -121,9 +121,9 @@ KERNEL(sum_partials) {
 // The recurrent cell: LayerNorm of `pre` [rows, 3d], gates, h'. p: pre, gain, shift, h, next, stats, next again (or null).
 // n: rows, d, stride of pre, of h, of next, wide, stride of next again. f: eps.
 KERNEL(cell_forward) {
-    const float *pre = (const float *)a.p[0], *gain = (const float *)a.p[1], *shift = (const float *)a.p[2];
-    const float *h = (const float *)a.p[3];
-    float *next = (float *)a.p[4], *stats = (float *)a.p[5], *again = (float *)a.p[6];
+    const float *pre = (const float *)AT(0), *gain = (const float *)AT(1), *shift = (const float *)AT(2);
+    const float *h = (const float *)AT(3);
+    float *next = (float *)AT(4), *stats = (float *)AT(5), *again = (float *)AT(6);
     int d = a.n[1], width = 3 * d;
     Team t = team(a.n[5]);
     for (int r = t.first; r < a.n[0]; r += t.step) {
@@ -151,10 +151,10 @@ KERNEL(cell_forward) {
 // p: pre, gain, shift, h, stats, d_next, d_gates (after the LayerNorm), d_pre, d_h (added to), d_next again (or null).
 // n: rows, d, stride of pre, of h, of d_next, of d_h, wide, stride of d_next again.
 KERNEL(cell_backward) {
-    const float *pre = (const float *)a.p[0], *gain = (const float *)a.p[1], *shift = (const float *)a.p[2];
-    const float *h = (const float *)a.p[3], *stats = (const float *)a.p[4], *d_next = (const float *)a.p[5];
-    float *d_gates = (float *)a.p[6], *d_pre = (float *)a.p[7], *d_h = (float *)a.p[8];
-    const float *again = (const float *)a.p[9];
+    const float *pre = (const float *)AT(0), *gain = (const float *)AT(1), *shift = (const float *)AT(2);
+    const float *h = (const float *)AT(3), *stats = (const float *)AT(4), *d_next = (const float *)AT(5);
+    float *d_gates = (float *)AT(6), *d_pre = (float *)AT(7), *d_h = (float *)AT(8);
+    const float *again = (const float *)AT(9);
     int d = a.n[1], width = 3 * d;
     Team t = team(a.n[6]);
     for (int r = t.first; r < a.n[0]; r += t.step) {

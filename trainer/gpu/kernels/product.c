@@ -92,7 +92,7 @@ UNROLL
 // y [m, n] = x [m, k] w^T, w [n, k], or added to y. k and all strides are multiples of 4.
 // p: x, w, y. n: m, n, k, stride of x, of w, of y, add, warps that share k.
 KERNEL(product_few_rows) {
-    Product p = {(const float *)a.p[0], (const float *)a.p[1], (float *)a.p[2], a.n[0], a.n[1], a.n[2], a.n[3], a.n[4], a.n[5], a.n[6]};
+    Product p = {(const float *)AT(0), (const float *)AT(1), (float *)AT(2), a.n[0], a.n[1], a.n[2], a.n[3], a.n[4], a.n[5], a.n[6]};
     int shares = LANES == 1 ? 1 : a.n[7];
     if (p.m <= ROWS_AT_ONCE / 2) few_rows(p, ROWS_AT_ONCE / 2, shares, BLOCK, BLOCKS);
     else few_rows(p, ROWS_AT_ONCE, shares, BLOCK, BLOCKS);
@@ -102,8 +102,8 @@ KERNEL(product_few_rows) {
 // p: x, w, y. n: m, n, k, stride of x, of w, of y, add.
 KERNEL(product_few_rows_back) {
     SHARED(shared);
-    const float *x = (const float *)a.p[0], *w = (const float *)a.p[1];
-    float *y = (float *)a.p[2];
+    const float *x = (const float *)AT(0), *w = (const float *)AT(1);
+    float *y = (float *)AT(2);
     int m = a.n[0], n = a.n[1], k = a.n[2], columns = (n + 31) / 32, from = BLOCK / columns * ROWS_AT_ONCE;
     for (int lane = LANE; lane < 32; lane += LANES) {
         int column = BLOCK % columns * 32 + lane, inside = column < n ? column : n - 1;

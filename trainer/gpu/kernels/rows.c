@@ -2,15 +2,15 @@
 
 // Every row of y becomes `row`. p: row, y. n: rows, width, stride of y.
 KERNEL(fill_rows) {
-    const float *row = (const float *)a.p[0];
-    float *y = (float *)a.p[1];
+    const float *row = (const float *)AT(0);
+    float *y = (float *)AT(1);
     FOR_ALL(i, a.n[0] * a.n[1]) y[i / a.n[1] * a.n[2] + i % a.n[1]] = row[i % a.n[1]];
 }
 
 // y = factor * x, or added to y. p: x, y. n: rows, width, stride of x, of y, add. f: factor.
 KERNEL(copy_rows) {
-    const float *x = (const float *)a.p[0];
-    float *y = (float *)a.p[1];
+    const float *x = (const float *)AT(0);
+    float *y = (float *)AT(1);
     FOR_ALL(i, a.n[0] * a.n[1]) {
         int r = i / a.n[1], j = i % a.n[1];
         put(y + r * a.n[3] + j, a.n[4], a.f[0] * x[r * a.n[2] + j]);
@@ -20,8 +20,8 @@ KERNEL(copy_rows) {
 // Rows of x by index, or back: y[i] = x[index[i]], or x[index[i]] += y[i] where n[4] (each index at most once).
 // p: x, y, index (u32). n: rows of y, width, stride of x, of y, back.
 KERNEL(gather_rows) {
-    float *x = (float *)a.p[0], *y = (float *)a.p[1];
-    const u32 *index = (const u32 *)a.p[2];
+    float *x = (float *)AT(0), *y = (float *)AT(1);
+    const u32 *index = (const u32 *)AT(2);
     FOR_ALL(i, a.n[0] * a.n[1]) {
         int r = i / a.n[1], j = i % a.n[1];
         float *from = x + (int)index[r] * a.n[2] + j, *to = y + r * a.n[3] + j;
@@ -32,19 +32,19 @@ KERNEL(gather_rows) {
 
 // x = 0. p: x. n: rows, width, stride.
 KERNEL(zero) {
-    float *x = (float *)a.p[0];
+    float *x = (float *)AT(0);
     FOR_ALL(i, a.n[0] * a.n[1]) x[i / a.n[1] * a.n[2] + i % a.n[1]] = 0.0f;
 }
 
 // y = tanh(x), and dx += dy (1 - y^2) where n[1]. p: x, y; backward y, dy, dx. n: count, backward.
 KERNEL(tanh_of) {
     if (a.n[1]) {
-        const float *y = (const float *)a.p[0], *dy = (const float *)a.p[1];
-        float *dx = (float *)a.p[2];
+        const float *y = (const float *)AT(0), *dy = (const float *)AT(1);
+        float *dx = (float *)AT(2);
         FOR_ALL(i, a.n[0]) dx[i] += dy[i] * (1.0f - y[i] * y[i]);
     } else {
-        const float *x = (const float *)a.p[0];
-        float *y = (float *)a.p[1];
+        const float *x = (const float *)AT(0);
+        float *y = (float *)AT(1);
         FOR_ALL(i, a.n[0]) y[i] = tanhf(x[i]);
     }
 }
@@ -53,13 +53,13 @@ KERNEL(tanh_of) {
 // sequence) `initial` everywhere. p: first (u32) [rows], initial z, h, carried z, h, y of z, of h. n: rows, width of z, of h, stride of
 // carried z, of carried h, of y of z, of h.
 KERNEL(carry) {
-    const u32 *first = (const u32 *)a.p[0];
+    const u32 *first = (const u32 *)AT(0);
     u32 width = (u32)(a.n[1] + a.n[2]);
     FOR_ALL(i, a.n[0] * a.n[1] + a.n[0] * a.n[2]) {
         int r = (int)(i / width), j = (int)(i % width), of_h = j >= a.n[1];
         if (of_h) j -= a.n[1];
-        const float *initial = (const float *)a.p[1 + of_h], *carried = (const float *)a.p[3 + of_h];
-        float *y = (float *)a.p[5 + of_h];
+        const float *initial = (const float *)AT(1 + of_h), *carried = (const float *)AT(3 + of_h);
+        float *y = (float *)AT(5 + of_h);
         int begins = !carried || first[r];
         y[r * a.n[5 + of_h] + j] = begins ? initial[j] : carried[r * a.n[3 + of_h] + j];
     }
@@ -67,12 +67,12 @@ KERNEL(carry) {
 
 // p: first, d_initial of z, of h (added to), d_carried of z, of h (added to), dy of z, of h. n as `carry`, of the gradients. 32 columns a turn.
 KERNEL(carry_backward) {
-    const u32 *first = (const u32 *)a.p[0];
+    const u32 *first = (const u32 *)AT(0);
     int of_z = (a.n[1] + 31) / 32, turns = of_z + (a.n[2] + 31) / 32;
     for (int turn = BLOCK; turn < turns; turn += BLOCKS) {
         int of_h = turn >= of_z, width = a.n[1 + of_h], d_stride = a.n[3 + of_h], stride = a.n[5 + of_h];
-        float *d_initial = (float *)a.p[1 + of_h], *d_carried = (float *)a.p[3 + of_h];
-        const float *dy = (const float *)a.p[5 + of_h];
+        float *d_initial = (float *)AT(1 + of_h), *d_carried = (float *)AT(3 + of_h);
+        const float *dy = (const float *)AT(5 + of_h);
         for (int lane = LANE; lane < 32; lane += LANES) {
             int j = (of_h ? turn - of_z : turn) * 32 + lane;
             float sum = 0.0f;
@@ -91,8 +91,8 @@ KERNEL(carry_backward) {
 
 // y [width, rows] = x^T, 32 by 32 numbers a turn. p: x, y. n: rows, width, stride of x.
 KERNEL(transpose) {
-    const float *x = (const float *)a.p[0];
-    float *y = (float *)a.p[1];
+    const float *x = (const float *)AT(0);
+    float *y = (float *)AT(1);
     int rows = a.n[0], width = a.n[1], across = (width + 31) / 32, turns = across * ((rows + 31) / 32);
     for (int turn = BLOCK; turn < turns; turn += BLOCKS) {
         int from = turn / across * 32, left = turn % across * 32;
@@ -113,8 +113,8 @@ KERNEL(transpose) {
 
 // a / max(1, |a|) of every number. p: x, y. n: rows, width, stride of x, of y.
 KERNEL(normalise_action) {
-    const float *x = (const float *)a.p[0];
-    float *y = (float *)a.p[1];
+    const float *x = (const float *)AT(0);
+    float *y = (float *)AT(1);
     FOR_ALL(i, a.n[0] * a.n[1]) {
         float value = x[i / a.n[1] * a.n[2] + i % a.n[1]];
         y[i / a.n[1] * a.n[3] + i % a.n[1]] = value / fmaxf(1.0f, fabsf(value));
@@ -123,11 +123,11 @@ KERNEL(normalise_action) {
 
 // out = factor * sum of x [count], each number raised to `floor` where n[1], by one block. p: x, out. n: count, floored. f: factor, floor.
 KERNEL(sum_of) {
-    const float *x = (const float *)a.p[0];
+    const float *x = (const float *)AT(0);
     float sum = 0.0f;
     for (int i = THREAD; i < a.n[0]; i += THREADS) sum += a.n[1] ? fmaxf(x[i], a.f[1]) : x[i];
     sum = block_sum(sum);
-    if (THREAD == 0) *(float *)a.p[1] = a.f[0] * sum;
+    if (THREAD == 0) *(float *)AT(1) = a.f[0] * sum;
 }
 
 #define ROTATED(x, by) (((x) << (by)) | ((x) >> (32 - (by))))
@@ -142,8 +142,8 @@ DEVICE float uniform_of(u32 word) { return ((float)(word >> 9) + 0.5f) * (1.0f /
 // -log(-log u); or normal (n[1]), one from two words (Box and Muller). The words are the CPU's; logarithms may round otherwise.
 // p: control (u32: key 8, stream 2), out. n: count, normal, first word (even) as quotient and remainder of 2^24.
 KERNEL(noise) {
-    const u32 *control = (const u32 *)a.p[0];
-    float *out = (float *)a.p[1];
+    const u32 *control = (const u32 *)AT(0);
+    float *out = (float *)AT(1);
     long words = (long)a.n[0] * (a.n[1] ? 2 : 1), from = ((long)a.n[2] << 24) + a.n[3];
     int blocks = (int)((from + words + 15) / 16 - from / 16);
     FOR_ALL(i, blocks) {

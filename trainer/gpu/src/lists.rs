@@ -215,14 +215,19 @@ fn share_out(commands: &[&Command], width: usize) -> Vec<Task> {
     tasks.collect()
 }
 
-/// Numbers of a weight that are read, or as many as take the same time.
+/// Numbers of a weight that a product reads for 16 rows, or as many as take the time of another kernel, which is that of its functions and sums
+/// over a row.
 fn work_of(command: &Command) -> usize {
-    match command {
-        Command::Kernel { kernel: Kernel::ProductFewRows, n, .. } => {
-            (n[0] as usize).div_ceil(16) * n[1] as usize * n[2] as usize
-        }
-        Command::Kernel { .. } => 1 << 16,
-        _ => 0,
+    let Command::Kernel { kernel, n, .. } = command else { return 0 };
+    let n = |at: usize| n[at] as usize;
+    match kernel {
+        Kernel::ProductFewRows => n(0).div_ceil(16) * n(1) * n(2),
+        Kernel::NormForward | Kernel::NormBackward => 8 * n(0) * n(1),
+        Kernel::CellForward | Kernel::CellBackward => 64 * n(0) * n(1),
+        Kernel::Draw | Kernel::DrawBackward => 8 * n(0) * n(1) * n(2),
+        Kernel::Carry | Kernel::CarryBackward => 4 * n(0) * (n(1) + n(2)),
+        Kernel::InteractionForward | Kernel::InteractionBackward => 256 * n(0) * n(1) * n(3),
+        _ => 2 * n(0) * n(1),
     }
 }
 
