@@ -1,5 +1,6 @@
 //! The kernels compiled as C, one thread a block, block after block. For tests: nothing here is fast.
 
+use std::sync::{Mutex, PoisonError};
 use std::time::Instant;
 
 use super::{Args, Kernel, PartTime, begin};
@@ -134,7 +135,11 @@ impl Host {
     }
 }
 
+/// The kernels' shared memory is one for all threads of the process.
+static SHARED: Mutex<()> = Mutex::new(());
+
 fn call(kernel: Kernel, args: Args, blocks: usize) {
+    let _held = SHARED.lock().unwrap_or_else(PoisonError::into_inner);
     let function = kernel.on_host();
     for block in 0..blocks as i32 {
         // SAFETY: the arguments are those that the kernel's description names, and its buffers are as large as its counts say.
