@@ -34,32 +34,53 @@ UNROLL
 }
 #endif
 
-// Four columns of `rows` rows (8 or 16) by `shares` warps, which share k; as many fours at a time as a block has warps for.
-DEVICE void few_rows(Product p, const int rows, int shares, int BLOCK, int BLOCKS) {
+// Four columns of `rows` rows (8 or 16) by `shares` warps, which share k; as many fours at a time as a block has warps for. Where `staged`, x [at
+// most `rows`, k] is brought to shared memory first, all of it at once: every warp of a block reads it.
+DEVICE void few_rows(Product p, const int rows, const int staged, int shares, float *shared, int BLOCK, int BLOCKS) {
     int columns = (p.n + COLUMNS_AT_ONCE - 1) / COLUMNS_AT_ONCE, tasks = columns * ((p.m + rows - 1) / rows);
-    int at_once = WARPS / shares, share = WARP % shares;
+    int at_once = WARPS / shares, share = WARP % shares, step = 4 * LANES * shares;
+#ifdef __CUDACC__
+    if (staged && BLOCK * at_once < tasks) {
+        for (int r = WARP; r < p.m; r += WARPS)
+            for (int at = 4 * LANE; at < p.k; at += 4 * LANES)
+                asm volatile("cp.async.cg.shared.global [%0], [%1], 16;" ::"r"((u32)__cvta_generic_to_shared(shared + r * p.k + at)),
+                             "l"(p.x + r * p.of_x + at) : "memory");
+    }
+#endif
     for (int task = BLOCK * at_once + WARP / shares; task - WARP / shares < tasks; task += BLOCKS * at_once) {
-        int first = task % columns * COLUMNS_AT_ONCE, from = task / columns * rows;
+        int first = task % columns * COLUMNS_AT_ONCE, from = task / columns * rows, at = 4 * (share * LANES + LANE);
         float sums[ROWS_AT_ONCE * COLUMNS_AT_ONCE];
+        Four w[COLUMNS_AT_ONCE];
+        const float *of_w[COLUMNS_AT_ONCE];
 UNROLL
         for (int i = 0; i < rows * COLUMNS_AT_ONCE; i++) sums[i] = 0.0f;
+UNROLL
+        for (int c = 0; c < COLUMNS_AT_ONCE; c++) {
+            of_w[c] = p.w + (first + c < p.n ? first + c : p.n - 1) * p.of_w;
+            if (at < p.k) w[c] = *(const Four *)(of_w[c] + at);
+        }
+#ifdef __CUDACC__
+        if (staged && task - WARP / shares == BLOCK * at_once) {
+            asm volatile("cp.async.wait_all;" ::: "memory");
+            __syncthreads();
+        }
+#endif
         if (task < tasks) {
-            const float *of_w[COLUMNS_AT_ONCE];
-UNROLL
-            for (int c = 0; c < COLUMNS_AT_ONCE; c++) of_w[c] = p.w + (first + c < p.n ? first + c : p.n - 1) * p.of_w;
-            for (int at = 4 * (share * LANES + LANE); at < p.k; at += 4 * LANES * shares) {
-                int of_x = from * p.of_x + at;
-                Four w[COLUMNS_AT_ONCE];
-UNROLL
-                for (int c = 0; c < COLUMNS_AT_ONCE; c++) w[c] = *(const Four *)(of_w[c] + at);
+NO_UNROLL
+            for (; at < p.k; at += step) {
+                int of_x = staged ? at : from * p.of_x + at;
 UNROLL
                 for (int r = 0; r < rows; r++) {
-                    Four x = *(const Four *)(p.x + of_x);
-                    of_x += from + r + 1 < p.m ? p.of_x : 0;
+                    Four x = *(const Four *)((staged ? shared : p.x) + of_x);
+                    if (staged) of_x += r + 1 < p.m ? p.k : 0;
+                    else of_x += from + r + 1 < p.m ? p.of_x : 0;
 UNROLL
                     for (int c = 0; c < COLUMNS_AT_ONCE; c++)
                         sums[r * COLUMNS_AT_ONCE + c] += x.x * w[c].x + x.y * w[c].y + x.z * w[c].z + x.w * w[c].w;
                 }
+UNROLL
+                for (int c = 0; c < COLUMNS_AT_ONCE; c++)
+                    if (at + step < p.k) w[c] = *(const Four *)(of_w[c] + at + step);
             }
         }
 #ifdef __CUDACC__
@@ -90,12 +111,15 @@ UNROLL
 }
 
 // y [m, n] = x [m, k] w^T, w [n, k], or added to y. k and all strides are multiples of 4.
-// p: x, w, y. n: m, n, k, stride of x, of w, of y, add, warps that share k.
+// p: x, w, y. n: m, n, k, stride of x, of w, of y, add, warps that share k, whether x [at most 16, k] goes to shared memory.
 KERNEL(product_few_rows) {
+    SHARED(shared);
     Product p = {(const float *)AT(0), (const float *)AT(1), (float *)AT(2), a.n[0], a.n[1], a.n[2], a.n[3], a.n[4], a.n[5], a.n[6]};
-    int shares = LANES == 1 ? 1 : a.n[7];
-    if (p.m <= ROWS_AT_ONCE / 2) few_rows(p, ROWS_AT_ONCE / 2, shares, BLOCK, BLOCKS);
-    else few_rows(p, ROWS_AT_ONCE, shares, BLOCK, BLOCKS);
+    int shares = LANES == 1 ? 1 : a.n[7], staged = LANES == 1 ? 0 : a.n[8];
+    if (staged && p.m <= 8) few_rows(p, 8, 1, shares, shared, BLOCK, BLOCKS);
+    else if (staged) few_rows(p, 16, 1, shares, shared, BLOCK, BLOCKS);
+    else if (p.m <= 8) few_rows(p, 8, 0, shares, 0, BLOCK, BLOCKS);
+    else few_rows(p, 16, 0, shares, 0, BLOCK, BLOCKS);
 }
 
 // y [m, n] = x [m, k] w, w [k, n], or added to y: 32 columns of 16 rows a block, whose warps share k. k and the stride of x are multiples of 4.

@@ -72,15 +72,24 @@ pub fn gather(finished: &mut Finished, width: usize) {
     for range in std::mem::take(&mut finished.forked).into_iter().rev() {
         let items = &finished.items[range.clone()];
         let (Some(lists), Some(first)) = (lists_of(items, width), items.first()) else { continue };
-        let shared = |item: &Item| match &item.command {
-            Command::Kernel { grid, .. } => grid.shared_bytes,
-            _ => 0,
-        };
-        let shared_bytes = items.iter().map(shared).max().unwrap_or_default();
+        let shared_bytes = items.iter().map(shared_bytes).max().unwrap_or_default();
         let (part, lane) = (first.part, Lane::Main);
         let lists = Lists { lists, width, shared_bytes, places: [0; 4] };
         let item = Item { part, lane, command: Command::Lists(Box::new(lists)) };
         finished.items.splice(range, [item]);
+    }
+}
+
+/// Shared memory of a block that a command takes in a list.
+#[must_use]
+pub fn shared_bytes(item: &Item) -> usize {
+    match &item.command {
+        // x, at most 16 rows of it.
+        Command::Kernel { kernel: Kernel::ProductFewRows, n, .. } => {
+            4 * n[0].min(16) as usize * n[2] as usize
+        }
+        Command::Kernel { kernel, grid, .. } if LISTED.contains(kernel) => grid.shared_bytes,
+        _ => 0,
     }
 }
 
@@ -241,6 +250,7 @@ fn fit(kernel: Kernel, n: &mut [i32], blocks: usize) {
             // Warps that would have nothing share a product's depth, 128 numbers of it at least.
             let shares = (WARPS / each.min(WARPS)).min(depth.div_ceil(128)).max(1);
             n[7] = 1 << shares.ilog2();
+            n[8] = i32::from(rows <= 16);
         }
         // A warp a row; of the cell, whose rows are wide, a block.
         Kernel::NormForward => n[5] = 0,

@@ -353,7 +353,7 @@ impl Program {
         match product.with_few_rows() {
             Some((kernel, grid)) => {
                 let Product { a, b, c, add, .. } = product;
-                let n = [m, n, k, a.stride, b.stride, c.stride, usize::from(add), grid.threads / 32];
+                let n = [m, n, k, a.stride, b.stride, c.stride, usize::from(add), grid.threads / 32, 0];
                 self.kernel(kernel, grid, &[a.into(), b.into(), c.into()], &n, &[]);
             }
             None => self.push(Command::Product(product)),

@@ -5,7 +5,7 @@ use std::ffi::c_void;
 use cudarc::driver::{CudaFunction, CudaStream, sys};
 
 use super::{Nvidia, failed};
-use crate::lists::{LISTED, Lists, Task, WARPS, gather};
+use crate::lists::{LISTED, Lists, Task, WARPS, gather, shared_bytes};
 use crate::machine::{Args, GpuError, LIST_WIDTHS};
 use crate::program::{Command, Finished};
 
@@ -54,11 +54,7 @@ impl Nvidia {
     /// Makes lists of a program's forked parts where this GPU can run them, and uploads them.
     pub(in crate::machine) fn prepare(&mut self, finished: &mut Finished) -> Result<(), GpuError> {
         let Some(function) = self.lists.clone() else { return Ok(()) };
-        let shared_bytes = finished.items[..].iter().map(|item| match &item.command {
-            Command::Kernel { kernel, grid, .. } if LISTED.contains(kernel) => grid.shared_bytes,
-            _ => 0,
-        });
-        let shared_bytes = shared_bytes.max().unwrap_or_default();
+        let shared_bytes = finished.items.iter().map(shared_bytes).max().unwrap_or_default();
         let Some(width) = self.list_width(&function, shared_bytes)? else { return Ok(()) };
         gather(finished, width);
         for item in &mut finished.items {
