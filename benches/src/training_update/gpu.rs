@@ -63,6 +63,9 @@ pub struct GpuPart {
     pub tflops_per_s: f64,
 }
 
+/// Updates of the world model alone that are made at once, for each that is timed by itself.
+const ALONE: u32 = 5;
+
 /// Measures a case on the GPU of this number, with so many learners at once.
 pub fn measure(
     case: &Case,
@@ -87,7 +90,7 @@ pub fn measure(
             .collect()
     });
     let found = found.into_iter().collect::<Result<Vec<_>>>()?;
-    let rate: f64 = found.iter().map(|one| f64::from(updates) / one.world_alone.as_secs_f64()).sum();
+    let rate: f64 = found.iter().map(|one| f64::from(ALONE * updates) / one.world_alone.as_secs_f64()).sum();
     let first = found.into_iter().next().context("there is at least one learner")?;
     let parts = first
         .parts
@@ -176,7 +179,7 @@ fn one(
     }
     barrier.wait();
     let start = Instant::now();
-    for _ in 0..updates {
+    for _ in 0..ALONE * updates {
         world(&mut learner)?;
     }
     let world_alone = start.elapsed();

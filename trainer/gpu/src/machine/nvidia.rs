@@ -12,7 +12,7 @@ use cudarc::driver::{
     CudaContext, CudaEvent, CudaFunction, CudaGraph, CudaSlice, CudaStream, DevicePtr, DeviceRepr,
     LaunchConfig, PushKernelArg, result, sys,
 };
-use cudarc::nvrtc::{CompileOptions, compile_ptx_with_opts};
+use cudarc::nvrtc::{CompileOptions, Ptx, compile_ptx_with_opts};
 
 use super::host::flops;
 use super::{Args, CommandTime, GpuError, Kernel, PartTime, Precision, begin};
@@ -85,6 +85,21 @@ fn failed<E: std::fmt::Debug>(what: &'static str) -> impl FnOnce(E) -> GpuError 
     move |reason| GpuError::Failed { what, reason: format!("{reason:?}") }
 }
 
+/// The kernels for an architecture, compiled once a process: it takes seconds.
+fn compiled(architecture: &str) -> Result<Ptx, GpuError> {
+    static KNOWN: Mutex<Vec<(String, Ptx)>> = Mutex::new(Vec::new());
+    let mut known = KNOWN.lock().unwrap_or_else(PoisonError::into_inner);
+    if let Some((_, ptx)) = known.iter().find(|(name, _)| name == architecture) {
+        return Ok(ptx.clone());
+    }
+    let options = vec![format!("--gpu-architecture={architecture}")];
+    let options = CompileOptions { options, ..CompileOptions::default() };
+    let ptx = compile_ptx_with_opts(source(), options)
+        .map_err(|error| GpuError::Failed { what: "compiling the kernels", reason: format!("{error:?}") })?;
+    known.push((architecture.to_owned(), ptx.clone()));
+    Ok(ptx)
+}
+
 impl Nvidia {
     pub(super) fn new(ordinal: usize, precision: Precision) -> Result<Self, GpuError> {
         // Libraries that are not there make cudarc panic; that is no reason to print a backtrace.
@@ -105,14 +120,7 @@ impl Nvidia {
         unsafe { context.disable_event_tracking() };
         let stream = context.new_stream().map_err(failed("making a stream"))?;
         let (major, minor) = context.compute_capability().map_err(failed("asking for the architecture"))?;
-        let options = CompileOptions {
-            options: vec![format!("--gpu-architecture=compute_{major}{minor}")],
-            ..CompileOptions::default()
-        };
-        let ptx = compile_ptx_with_opts(source(), options).map_err(|error| GpuError::Failed {
-            what: "compiling the kernels",
-            reason: format!("{error:?}"),
-        })?;
+        let ptx = compiled(&format!("compute_{major}{minor}"))?;
         let module = context.load_module(ptx).map_err(failed("loading the kernels"))?;
         let mut kernels = HashMap::new();
         for kernel in Kernel::ALL {
