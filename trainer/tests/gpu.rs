@@ -248,5 +248,8 @@ fn a_gpu_gives_what_the_host_gives() {
             let machine = Machine::nvidia(0, Precision::F32).unwrap();
             compare(machine, Preset::Debug, kind, masks, paint_every, 1e-4);
         }
+        // A scan that is large enough not to go by lists.
+        let machine = Machine::nvidia(0, Precision::F32).unwrap();
+        compare(machine, Preset::Paper, kind, true, 1, 1e-4);
     }
 }

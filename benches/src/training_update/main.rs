@@ -68,7 +68,6 @@ enum Place {
 enum Products {
     F32,
     Tf32,
-    Bf16,
 }
 
 impl From<Products> for Precision {
@@ -76,7 +75,6 @@ impl From<Products> for Precision {
         match products {
             Products::F32 => Self::F32,
             Products::Tf32 => Self::Tf32,
-            Products::Bf16 => Self::Bf16,
         }
     }
 }

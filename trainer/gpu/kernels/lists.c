@@ -48,7 +48,7 @@ DEVICE void perform(const Task *task, int block) {
         case 1: zero_in(a, block, blocks); break;
         case 2: carry_in(a, block, blocks); break;
         case 3: carry_backward_in(a, block, blocks); break;
-        case 4: product_few_rows_in(a, block, blocks); break;
+        case 4: product_listed_in(a, block, blocks); break;
         case 5: norm_forward_in(a, block, blocks); break;
         case 6: norm_backward_in(a, block, blocks); break;
         case 7: cell_forward_in(a, block, blocks); break;

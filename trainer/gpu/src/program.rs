@@ -353,7 +353,8 @@ impl Program {
         match product.with_few_rows() {
             Some((kernel, grid)) => {
                 let Product { a, b, c, add, .. } = product;
-                let n = [m, n, k, a.stride, b.stride, c.stride, usize::from(add), grid.threads / 32, 0];
+                // The last two are for lists, which set them.
+                let n = [m, n, k, a.stride, b.stride, c.stride, usize::from(add), 0, 0];
                 self.kernel(kernel, grid, &[a.into(), b.into(), c.into()], &n, &[]);
             }
             None => self.push(Command::Product(product)),

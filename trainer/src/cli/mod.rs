@@ -161,7 +161,7 @@ struct ComputeArguments {
     /// for when it is asked for)
     #[arg(long, default_value = "cpu")]
     device: String,
-    /// Precision of matrix products on a GPU: tf32 and bf16 round the factors, sums stay f32
+    /// Precision of matrix products on a GPU: tf32 rounds the factors to 10 bits, sums stay f32
     #[arg(long, value_enum, default_value = "f32")]
     precision: PrecisionName,
 }
@@ -170,7 +170,6 @@ struct ComputeArguments {
 enum PrecisionName {
     F32,
     Tf32,
-    Bf16,
 }
 
 impl ComputeArguments {
@@ -179,7 +178,6 @@ impl ComputeArguments {
         let precision = match self.precision {
             PrecisionName::F32 => Precision::F32,
             PrecisionName::Tf32 => Precision::Tf32,
-            PrecisionName::Bf16 => Precision::Bf16,
         };
         match text.split_once(':').unwrap_or((text, "0")) {
             ("cpu", _) if self.precision != PrecisionName::F32 => {

@@ -56,8 +56,6 @@ pub enum Precision {
     F32,
     /// Operands with 10 bits of mantissa (TF32) on the tensor cores.
     Tf32,
-    /// Operands with 7 bits of mantissa (bf16) on the tensor cores.
-    Bf16,
 }
 
 /// The host, or a GPU.
@@ -315,7 +313,8 @@ kernels! {
     ActorDraw actor_draw, ActorBackward actor_backward, LambdaReturns lambda_returns, ActorLoss actor_loss,
     ReturnRange return_range, Squares squares, Clip clip, Adam adam, Mix mix,
     NarrowForward narrow_forward, NarrowBackward narrow_backward,
-    ProductFewRows product_few_rows, ProductFewRowsBack product_few_rows_back,
+    ProductFewRows product_few_rows, ProductListed product_listed,
+    ProductFewRowsBack product_few_rows_back,
 }
 
 /// Arguments as kernels take them; the same in `kernels/common.h`.

@@ -159,7 +159,7 @@ impl Nvidia {
             .result()
             .map_err(failed("giving cuBLAS memory"))?;
         let mode = match self.precision {
-            Precision::F32 | Precision::Bf16 => blas_sys::cublasMath_t::CUBLAS_DEFAULT_MATH,
+            Precision::F32 => blas_sys::cublasMath_t::CUBLAS_DEFAULT_MATH,
             Precision::Tf32 => blas_sys::cublasMath_t::CUBLAS_TF32_TENSOR_OP_MATH,
         };
         // SAFETY: the handle is alive.
@@ -329,7 +329,6 @@ impl Nvidia {
         let compute = match self.precision {
             Precision::F32 => blas_sys::cublasComputeType_t::CUBLAS_COMPUTE_32F,
             Precision::Tf32 => blas_sys::cublasComputeType_t::CUBLAS_COMPUTE_32F_FAST_TF32,
-            Precision::Bf16 => blas_sys::cublasComputeType_t::CUBLAS_COMPUTE_32F_FAST_16BF,
         };
         let (one, beta) = (1f32, if p.add { 1f32 } else { 0f32 });
         let f32_type = blas_sys::cudaDataType_t::CUDA_R_32F;
