@@ -213,13 +213,11 @@ fn gradients_on(machine: Machine, kind: ModelKind) -> (BTreeMap<String, Vec<f32>
 }
 
 #[test]
-fn what_a_scan_does_side_by_side_may_be_done_in_any_order() {
+fn what_lanes_compute_does_not_depend_on_how_they_meet() {
     for kind in [ModelKind::Rcwm, ModelKind::Vanilla] {
-        let (found, commands) = gradients_on(Machine::host(), kind);
-        let (in_reverse, _) = gradients_on(Machine::host_in_reverse(), kind);
-        assert_eq!(found, in_reverse);
-        println!("{kind:?}: {commands} commands");
-        assert!(commands < 400, "the scan is not one launch each way: {commands} commands");
+        let (found, _) = gradients_on(Machine::host(), kind);
+        let (late, _) = gradients_on(Machine::host_with_side_late(), kind);
+        assert_eq!(found, late);
     }
 }
 
@@ -248,7 +246,7 @@ fn a_gpu_gives_what_the_host_gives() {
             let machine = Machine::nvidia(0, Precision::F32).unwrap();
             compare(machine, Preset::Debug, kind, masks, paint_every, 1e-4);
         }
-        // A scan that is large enough not to go by lists.
+        // The paper's sizes, too.
         let machine = Machine::nvidia(0, Precision::F32).unwrap();
         compare(machine, Preset::Paper, kind, true, 1, 1e-4);
     }

@@ -5,110 +5,27 @@
 #define ROWS_AT_ONCE 16
 #define COLUMNS_AT_ONCE 4
 
-typedef struct {
-    const float *x, *w;
-    float *y;
-    int m, n, k, of_x, of_w, of_y, add;
-} Product;
-
 #ifdef __CUDACC__
-// The sums over a warp of 2 h numbers a lane, first step: each lane keeps h of them, the other lane's share added.
+// The sum over a warp of 64 numbers a lane: lane i ends with numbers 2 i and 2 i + 1.
 #define HALVE(o, h)                                                                      \
     for (int i = 0; i < h; i++) {                                                        \
         float sent = LANE & o ? sums[i] : sums[i + h], kept = LANE & o ? sums[i + h] : sums[i]; \
         sums[i] = kept + __shfl_xor_sync(0xffffffffu, sent, o);                          \
     }
 
-// The sums over a warp of 32 `each` numbers a lane: lane i ends with numbers `each` i and on.
-DEVICE void scatter_sums(float *sums, const int each) {
+DEVICE void scatter_sums(float *sums) {
 UNROLL
-    HALVE(16, 16 * each)
+    HALVE(16, 32)
 UNROLL
-    HALVE(8, 8 * each)
+    HALVE(8, 16)
 UNROLL
-    HALVE(4, 4 * each)
+    HALVE(4, 8)
 UNROLL
-    HALVE(2, 2 * each)
+    HALVE(2, 4)
 UNROLL
-    HALVE(1, each)
+    HALVE(1, 2)
 }
 #endif
-
-// Four columns of `rows` rows (8 or 16) by `shares` warps, which share k; as many fours at a time as a block has warps for. Where `staged`, x [at
-// most `rows`, k] is brought to shared memory first, all of it at once: every warp of a block reads it.
-DEVICE void few_rows(Product p, const int rows, const int staged, int shares, float *shared, int BLOCK, int BLOCKS) {
-    int columns = (p.n + COLUMNS_AT_ONCE - 1) / COLUMNS_AT_ONCE, tasks = columns * ((p.m + rows - 1) / rows);
-    int at_once = WARPS / shares, share = WARP % shares, step = 4 * LANES * shares;
-#ifdef __CUDACC__
-    if (staged && BLOCK * at_once < tasks) {
-        for (int r = WARP; r < p.m; r += WARPS)
-            for (int at = 4 * LANE; at < p.k; at += 4 * LANES)
-                asm volatile("cp.async.cg.shared.global [%0], [%1], 16;" ::"r"((u32)__cvta_generic_to_shared(shared + r * p.k + at)),
-                             "l"(p.x + r * p.of_x + at) : "memory");
-    }
-#endif
-    for (int task = BLOCK * at_once + WARP / shares; task - WARP / shares < tasks; task += BLOCKS * at_once) {
-        int first = task % columns * COLUMNS_AT_ONCE, from = task / columns * rows, at = 4 * (share * LANES + LANE);
-        float sums[ROWS_AT_ONCE * COLUMNS_AT_ONCE];
-        Four w[COLUMNS_AT_ONCE];
-        const float *of_w[COLUMNS_AT_ONCE];
-UNROLL
-        for (int i = 0; i < rows * COLUMNS_AT_ONCE; i++) sums[i] = 0.0f;
-UNROLL
-        for (int c = 0; c < COLUMNS_AT_ONCE; c++) {
-            of_w[c] = p.w + (first + c < p.n ? first + c : p.n - 1) * p.of_w;
-            if (at < p.k) w[c] = *(const Four *)(of_w[c] + at);
-        }
-#ifdef __CUDACC__
-        if (staged && task - WARP / shares == BLOCK * at_once) {
-            asm volatile("cp.async.wait_all;" ::: "memory");
-            __syncthreads();
-        }
-#endif
-        if (task < tasks) {
-NO_UNROLL
-            for (; at < p.k; at += step) {
-                int of_x = staged ? at : from * p.of_x + at;
-UNROLL
-                for (int r = 0; r < rows; r++) {
-                    Four x = *(const Four *)((staged ? shared : p.x) + of_x);
-                    if (staged) of_x += r + 1 < p.m ? p.k : 0;
-                    else of_x += from + r + 1 < p.m ? p.of_x : 0;
-UNROLL
-                    for (int c = 0; c < COLUMNS_AT_ONCE; c++)
-                        sums[r * COLUMNS_AT_ONCE + c] += x.x * w[c].x + x.y * w[c].y + x.z * w[c].z + x.w * w[c].w;
-                }
-UNROLL
-                for (int c = 0; c < COLUMNS_AT_ONCE; c++)
-                    if (at + step < p.k) w[c] = *(const Four *)(of_w[c] + at + step);
-            }
-        }
-#ifdef __CUDACC__
-        const int each = rows * COLUMNS_AT_ONCE / 32;
-        scatter_sums(sums, each);
-        if (shares > 1) {
-            __shared__ float parts[16][ROWS_AT_ONCE * COLUMNS_AT_ONCE];
-UNROLL
-            for (int i = 0; i < each; i++) parts[WARP][each * LANE + i] = sums[i];
-            __syncthreads();
-            if (share == 0)
-                for (int other = 1; other < shares; other++)
-UNROLL
-                    for (int i = 0; i < each; i++) sums[i] += parts[WARP + other][each * LANE + i];
-            __syncthreads();
-        }
-        if (share > 0 || task >= tasks) continue;
-UNROLL
-        for (int i = 0; i < each; i++) {
-            int row = from + (each * LANE + i) / COLUMNS_AT_ONCE, column = first + (each * LANE + i) % COLUMNS_AT_ONCE;
-#else
-        for (int i = 0; i < rows * COLUMNS_AT_ONCE; i++) {
-            int row = from + i / COLUMNS_AT_ONCE, column = first + i % COLUMNS_AT_ONCE;
-#endif
-            if (row < p.m && column < p.n) put(p.y + row * p.of_y + column, p.add, sums[i]);
-        }
-    }
-}
 
 // y [m, n] = x [m, k] w^T, w [n, k], or added to y: 4 columns of 16 rows a block, whose threads share k. k and all strides are multiples of 4.
 // p: x, w, y. n: m, n, k, stride of x, of w, of y, add.
@@ -140,7 +57,7 @@ UNROLL
     }
 #ifdef __CUDACC__
     __shared__ float shares[8][ROWS_AT_ONCE * COLUMNS_AT_ONCE];
-    scatter_sums(sums, 2);
+    scatter_sums(sums);
     shares[WARP][2 * LANE] = sums[0];
     shares[WARP][2 * LANE + 1] = sums[1];
     __syncthreads();
@@ -154,18 +71,6 @@ UNROLL
         long row = from + i / COLUMNS_AT_ONCE, column = first + i % COLUMNS_AT_ONCE;
         if (row < m && column < n) put(y + row * a.n[5] + column, a.n[6], sum);
     }
-}
-
-// The same in a list, by blocks of any number of warps.
-// p: x, w, y. n: m, n, k, stride of x, of w, of y, add, warps that share k, whether x [at most 16, k] goes to shared memory.
-KERNEL(product_listed) {
-    SHARED(shared);
-    Product p = {(const float *)AT(0), (const float *)AT(1), (float *)AT(2), a.n[0], a.n[1], a.n[2], a.n[3], a.n[4], a.n[5], a.n[6]};
-    int shares = LANES == 1 ? 1 : a.n[7], staged = LANES == 1 ? 0 : a.n[8];
-    if (staged && p.m <= 8) few_rows(p, 8, 1, shares, shared, BLOCK, BLOCKS);
-    else if (staged) few_rows(p, 16, 1, shares, shared, BLOCK, BLOCKS);
-    else if (p.m <= 8) few_rows(p, 8, 0, shares, 0, BLOCK, BLOCKS);
-    else few_rows(p, 16, 0, shares, 0, BLOCK, BLOCKS);
 }
 
 // y [m, n] = x [m, k] w, w [k, n], or added to y: 32 columns of 16 rows a block, whose warps share k. k and the stride of x are multiples of 4.

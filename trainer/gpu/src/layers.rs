@@ -442,7 +442,7 @@ impl Tape {
         // As `layout` in `kernels/interaction.c` has it.
         let (even, odd, across) = (m + 4, m + 1, r + 4);
         let floats = (3 * n + r) * even + n * across + (4 * m + 2 * r) * odd + 4;
-        let threads = (n / 4 * m).next_multiple_of(32).clamp(64, 512);
+        let threads = (n / 4 * m).next_multiple_of(32).clamp(256, 512);
         let grid = Grid { blocks: z.rows, threads, shared_bytes: 4 * floats };
         let norm = [parts.norm.gain.value, parts.norm.shift.value, e].map(Pointer::from);
         let p =

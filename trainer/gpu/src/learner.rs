@@ -298,7 +298,7 @@ impl Learner {
             0.0
         };
         self.machine.upload(self.room.keep, &[keep as f32])?;
-        let program = if batch.masks { &mut self.programs.masked } else { &mut self.programs.world };
+        let program = if batch.masks { &self.programs.masked } else { &self.programs.world };
         self.machine.run(program)?;
         let values = self.world_values(batch.masks)?;
         if values.total.is_finite() && values.gradient_norm.is_finite() {
@@ -313,7 +313,7 @@ impl Learner {
     /// [`GpuError::Failed`].
     pub fn judge_world(&mut self, batch: &Batch<'_>, noise: Noise) -> Result<WorldValues, GpuError> {
         self.upload(batch, noise)?;
-        self.machine.run(&mut self.programs.judge)?;
+        self.machine.run(&self.programs.judge)?;
         let values = self.world_values(false)?;
         Ok(WorldValues { gradient_norm: 0.0, ..values })
     }
@@ -325,7 +325,7 @@ impl Learner {
     pub fn update_behaviour(&mut self, rate: impl Fn(&str) -> f64) -> Result<BehaviourValues, GpuError> {
         self.upload_rates(1, &rate)?;
         self.upload_rates(2, &rate)?;
-        let Some(program) = &mut self.programs.behaviour else {
+        let Some(program) = &self.programs.behaviour else {
             return Err(GpuError::Unsupported("this learner was made without actor and critic".to_owned()));
         };
         self.machine.run(program)?;
@@ -658,13 +658,7 @@ impl Programs {
             .map(|(program, (offsets, bytes))| machine.prepare(program.finish(&offsets, bytes, &arena)));
         let mut next = || ready.next().expect("there are as many as were built");
         let (world, masked, judge) = (next()?, next()?, next()?);
-        let mut made = Self { world, masked, judge, behaviour: ready.next().transpose()? };
-        for program in
-            [&mut made.world, &mut made.masked, &mut made.judge].into_iter().chain(&mut made.behaviour)
-        {
-            machine.capture(program)?;
-        }
-        Ok(made)
+        Ok(Self { world, masked, judge, behaviour: ready.next().transpose()? })
     }
 }
 

@@ -5,7 +5,6 @@
 //! | module | holds |
 //! | --- | --- |
 //! | `program` | commands, buffers and how they share memory |
-//! | `lists` | forked parts of programs that one launch runs |
 //! | `machine` | where programs run: the host, or an NVIDIA GPU |
 //! | `tape` | gradients: every op adds its commands forward and says what to add backward |
 //! | `layers` | the model's layers on a tape |
@@ -18,7 +17,6 @@
 pub mod behaviour;
 pub mod layers;
 pub mod learner;
-pub mod lists;
 pub mod machine;
 pub mod program;
 pub mod tape;

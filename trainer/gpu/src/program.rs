@@ -2,7 +2,6 @@
 
 use std::ops::Range;
 
-use crate::lists::Lists;
 use crate::machine::{GpuError, Kernel, Machine};
 
 /// A place in memory.
@@ -164,10 +163,8 @@ pub enum Command {
         /// Factors.
         f: Vec<f32>,
     },
-    /// Another lane goes on only when this one has come here.
-    HandOver(Lane),
-    /// What one launch runs.
-    Lists(Box<Lists>),
+    /// The other lane goes on only when this one has come here.
+    HandOver,
     /// `c = a b + beta c`, row by row: a [m, k] or its transpose, b [k, n] or its transpose.
     Product(Product),
 }
@@ -225,10 +222,19 @@ pub enum Lane {
     /// Where every program begins and ends.
     #[default]
     Main,
-    /// Beside it, on the same stream or cluster: as much of both at a time as does not depend on each other.
-    Twin,
-    /// Beside both.
+    /// Beside it.
     Side,
+}
+
+impl Lane {
+    /// The other one.
+    #[must_use]
+    pub fn other(self) -> Self {
+        match self {
+            Self::Main => Self::Side,
+            Self::Side => Self::Main,
+        }
+    }
 }
 
 /// A command and where it belongs.
@@ -250,7 +256,7 @@ pub struct Program {
     sizes: Vec<usize>,
     part: u16,
     lane: Lane,
-    /// Where all lanes are in use: what is needed anywhere in such a range is kept for all of it.
+    /// Where both lanes are in use: what is needed anywhere in such a range is kept for all of it.
     forked: Vec<Range<usize>>,
 }
 
@@ -259,8 +265,6 @@ pub struct Program {
 pub struct Finished {
     /// The commands, with fixed places alone.
     pub items: Vec<Item>,
-    /// Which of them lie between a fork and its join, as far as they have not become lists.
-    pub forked: Vec<Range<usize>>,
     /// Names of parts.
     pub parts: Vec<&'static str>,
     /// Memory its buffers take together.
@@ -310,10 +314,10 @@ impl Program {
         self.lane
     }
 
-    /// `from` has come to where `to` may go on.
-    pub fn hand_over(&mut self, from: Lane, to: Lane) {
+    /// `from` has come to where the other lane may go on.
+    pub fn hand_over(&mut self, from: Lane) {
         let before = self.lane(from);
-        self.push(Command::HandOver(to));
+        self.push(Command::HandOver);
         self.lane(before);
     }
 
@@ -353,8 +357,7 @@ impl Program {
         match product.with_few_rows() {
             Some((kernel, grid)) => {
                 let Product { a, b, c, add, .. } = product;
-                // The last two are for lists, which set them.
-                let n = [m, n, k, a.stride, b.stride, c.stride, usize::from(add), 0, 0];
+                let n = [m, n, k, a.stride, b.stride, c.stride, usize::from(add)];
                 self.kernel(kernel, grid, &[a.into(), b.into(), c.into()], &n, &[]);
             }
             None => self.push(Command::Product(product)),
@@ -426,8 +429,7 @@ impl Program {
         let matrix = |m: Matrix| Matrix { place: fix(m.place), ..m };
         let items = self.items.into_iter().map(|item| {
             let command = match item.command {
-                Command::HandOver(to) => Command::HandOver(to),
-                Command::Lists(_) => unreachable!("lists are made of finished programs"),
+                Command::HandOver => Command::HandOver,
                 Command::Kernel { kernel, grid, p, n, f } => {
                     let p = p.into_iter().map(|p| Pointer { place: p.place.map(fix), ..p }).collect();
                     Command::Kernel { kernel, grid, p, n, f }
@@ -438,7 +440,7 @@ impl Program {
             };
             Item { command, ..item }
         });
-        Finished { items: items.collect(), forked: self.forked, parts: self.parts, bytes }
+        Finished { items: items.collect(), parts: self.parts, bytes }
     }
 }
 
@@ -455,7 +457,7 @@ impl Arena {
 fn each_place(command: &Command, mut look: impl FnMut(Place)) {
     match command {
         Command::Kernel { p, .. } => p.iter().filter_map(|p| p.place).for_each(look),
-        Command::HandOver(_) | Command::Lists(_) => (),
+        Command::HandOver => (),
         Command::Product(p) => [p.a, p.b, p.c].iter().for_each(|m| look(m.place)),
     }
 }

@@ -96,28 +96,28 @@ impl Tape {
         self.program.lane(Lane::Main);
     }
 
-    /// Ops of `body` run in `lane`, from where this one is now; so do theirs backward. This lane may not add to the gradients that they add to.
-    pub fn beside(&mut self, lane: Lane, body: impl FnOnce(&mut Self)) {
-        let here = self.program.current_lane();
-        self.hand_over(here, lane);
-        self.program.lane(lane);
+    /// Ops of `body` run beside the main lane, from where that is now; so do theirs backward. The main lane may not add to the gradients
+    /// that they add to, but after they are done.
+    pub fn beside(&mut self, body: impl FnOnce(&mut Self)) {
+        self.hand_over(Lane::Main);
+        self.program.lane(Lane::Side);
         body(self);
-        self.program.lane(here);
+        self.program.lane(Lane::Main);
     }
 
-    /// `to` goes on where `from` is; backward the other way.
-    fn hand_over(&mut self, from: Lane, to: Lane) {
-        self.program.hand_over(from, to);
-        self.on_backward(move |tape| tape.program.hand_over(to, from));
+    /// The other lane goes on where `from` is; backward the other way.
+    fn hand_over(&mut self, from: Lane) {
+        self.program.hand_over(from);
+        self.on_backward(move |tape| tape.program.hand_over(from.other()));
     }
 
-    /// Ops of `body` may use [`Tape::beside`]; all lanes are through when it ends, backward too.
+    /// Ops of `body` may use [`Tape::beside`]; both lanes are through when it ends, backward too.
     pub fn forked(&mut self, body: impl FnOnce(&mut Self)) {
         self.program.fork();
         self.on_backward(|tape| tape.program.join());
-        self.hand_over(Lane::Main, Lane::Side);
+        self.hand_over(Lane::Main);
         body(self);
-        self.hand_over(Lane::Side, Lane::Main);
+        self.hand_over(Lane::Side);
         self.program.join();
         self.on_backward(|tape| tape.program.fork());
     }

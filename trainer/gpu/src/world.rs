@@ -4,7 +4,7 @@ use rcwm_models::settings::{ModelKind, ModelSettings};
 
 use crate::layers::{Attending, Dense, Draw, Interaction, Linear, Norm, Source, Store, Weight};
 use crate::machine::Kernel;
-use crate::program::{Grid, Lane, Matrix, Pointer};
+use crate::program::{Grid, Matrix, Pointer};
 use crate::tape::Tape;
 
 /// Sizes of a batch and of the model.
@@ -541,16 +541,14 @@ fn scan(
             carry(tape, 0, rooms[0].input.columns(0..nm));
             rooms[0].step(tape, &branches[0], here.clone(), nm, (at(h_of(0)), robot_h.map(at)));
             if let (Some((prior, interaction)), Some(robot_h)) = (&interaction, robot_h) {
-                tape.beside(Lane::Twin, |tape| {
-                    let logits = prior.step(tape, at(robot_h), here.clone());
-                    tape.draw(logits, gumbel(t, 0), at(interaction.prior_z()), draw);
-                    tape.beside(Lane::Side, |tape| {
-                        carry(tape, 1, interaction.z());
-                        interaction.step(tape, at(robot_h), here.clone());
-                        rooms[1].step(tape, &branches[1], here.clone(), nm, (at(h_of(1)), None));
-                        let logits = posteriors[1].step(tape, at(h_of(1)), here.clone());
-                        tape.draw(logits, gumbel(t, 2), at(z_of(1)), draw);
-                    });
+                let logits = prior.step(tape, at(robot_h), here.clone());
+                tape.draw(logits, gumbel(t, 0), at(interaction.prior_z()), draw);
+                tape.beside(|tape| {
+                    carry(tape, 1, interaction.z());
+                    interaction.step(tape, at(robot_h), here.clone());
+                    rooms[1].step(tape, &branches[1], here.clone(), nm, (at(h_of(1)), None));
+                    let logits = posteriors[1].step(tape, at(h_of(1)), here.clone());
+                    tape.draw(logits, gumbel(t, 2), at(z_of(1)), draw);
                 });
             }
             let logits = posteriors[0].step(tape, at(h_of(0)), here.clone());

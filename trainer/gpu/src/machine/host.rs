@@ -4,8 +4,7 @@ use std::sync::{Mutex, PoisonError};
 use std::time::Instant;
 
 use super::{Args, Kernel, PartTime, begin};
-use crate::lists::{Phase, Task};
-use crate::program::{Command, Finished, Product};
+use crate::program::{Command, Finished, Lane, Product};
 
 pub(super) type Function = unsafe extern "C" fn(Args, i32, i32);
 
@@ -21,13 +20,13 @@ pub(super) mod functions {
 #[derive(Debug, Default)]
 pub struct Host {
     memory: Vec<Vec<u64>>,
-    /// Whether second lists run as early as they may, and their phases' tasks from the last to the first: what they compute does not change.
-    in_reverse: bool,
+    /// Whether the side lane comes as late as it may: what lanes compute does not depend on how they meet.
+    side_late: bool,
 }
 
 impl Host {
-    pub(super) fn in_reverse() -> Self {
-        Self { in_reverse: true, ..Self::default() }
+    pub(super) fn with_side_late() -> Self {
+        Self { side_late: true, ..Self::default() }
     }
 
     pub(super) fn allocate(&mut self, bytes: usize) -> u64 {
@@ -63,7 +62,18 @@ impl Host {
     }
 
     pub(super) fn run(&mut self, program: &Finished) {
-        program.items.iter().for_each(|item| self.execute(&item.command));
+        let mut waiting = Vec::new();
+        for item in &program.items {
+            let side = item.lane == Lane::Side;
+            if self.side_late && side && item.command != Command::HandOver {
+                waiting.push(&item.command);
+                continue;
+            }
+            if side {
+                waiting.drain(..).for_each(execute);
+            }
+            execute(&item.command);
+        }
     }
 
     pub(super) fn time_parts(&mut self, program: &Finished) -> Vec<PartTime> {
@@ -71,7 +81,7 @@ impl Host {
             program.parts.iter().map(|part| PartTime { part, commands: 0, ms: 0.0, flops: 0.0 }).collect();
         for item in &program.items {
             let start = Instant::now();
-            self.execute(&item.command);
+            execute(&item.command);
             let time = &mut times[usize::from(item.part)];
             time.ms += 1e3 * start.elapsed().as_secs_f64();
             time.commands += 1;
@@ -84,7 +94,7 @@ impl Host {
 /// Operations of a matrix product; kernels count as none.
 pub(super) fn flops(command: &Command) -> f64 {
     match command {
-        Command::Kernel { .. } | Command::HandOver(_) | Command::Lists(_) => 0.0,
+        Command::Kernel { .. } | Command::HandOver => 0.0,
         Command::Product(product) => {
             let (m, n, k) = product.sizes();
             2.0 * m as f64 * n as f64 * k as f64
@@ -92,46 +102,12 @@ pub(super) fn flops(command: &Command) -> f64 {
     }
 }
 
-impl Host {
-    fn execute(&self, command: &Command) {
-        match command {
-            Command::Kernel { kernel, grid, p, n, f } => {
-                // Loops over numbers and rows take any number of blocks; where the blocks are what is counted, all of them run.
-                call(*kernel, Args::new(p, n, f), grid.blocks);
-            }
-            Command::HandOver(_) => (),
-            Command::Lists(lists) => self.execute_lists(&lists.lists),
-            Command::Product(product) => multiply(product),
-        }
-    }
-
-    /// The first list, then the second; in reverse phases of the second come as soon as they may.
-    fn execute_lists(&self, lists: &[Vec<Phase>]) {
-        let Some((first, rest)) = lists.split_first() else { return };
-        let mut second = rest.iter().flatten().peekable();
-        let mut reached = 0;
-        for phase in first {
-            while self.in_reverse
-                && let Some(next) = second.next_if(|next| next.wait <= reached)
-            {
-                self.execute_phase(next);
-            }
-            self.execute_phase(phase);
-            reached = reached.max(phase.reach);
-        }
-        for next in second {
-            assert!(next.wait <= reached, "a list waits for what never comes");
-            self.execute_phase(next);
-        }
-    }
-
-    fn execute_phase(&self, phase: &Phase) {
-        let run = |task: &Task| call(task.kernel, Args::new(&task.p, &task.n, &task.f), task.blocks.len());
-        if self.in_reverse {
-            phase.tasks.iter().rev().for_each(run);
-        } else {
-            phase.tasks.iter().for_each(run);
-        }
+fn execute(command: &Command) {
+    match command {
+        // Loops over numbers and rows take any number of blocks; where the blocks are what is counted, all of them run.
+        Command::Kernel { kernel, grid, p, n, f } => call(*kernel, Args::new(p, n, f), grid.blocks),
+        Command::HandOver => (),
+        Command::Product(product) => multiply(product),
     }
 }
 

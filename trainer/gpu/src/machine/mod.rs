@@ -4,7 +4,6 @@ mod host;
 #[cfg(feature = "cuda")]
 mod nvidia;
 
-use crate::lists;
 use crate::program::{Command, Finished};
 
 pub use host::Host;
@@ -44,9 +43,6 @@ pub enum GpuError {
     #[error("{0}")]
     Unsupported(String),
 }
-
-/// Blocks of a cluster that runs a list: the first that the machine has.
-const LIST_WIDTHS: [usize; 2] = [16, 8];
 
 /// Precision of matrix products. Sums, weights and everything else stay f32.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
@@ -111,8 +107,8 @@ impl Machine {
 
     /// The host, which runs what may run in any order in another one than [`Machine::host`].
     #[must_use]
-    pub fn host_in_reverse() -> Self {
-        Self::Host(Host::in_reverse())
+    pub fn host_with_side_late() -> Self {
+        Self::Host(Host::with_side_late())
     }
 
     /// The GPU of this number.
@@ -189,45 +185,30 @@ impl Machine {
         Ok(())
     }
 
-    /// Makes a program ready.
+    /// Makes a program ready; on a GPU it is captured, so that its first run costs what every run does.
     ///
     /// # Errors
-    /// [`GpuError`] if its lists could not be brought to the machine.
-    pub fn prepare(&mut self, mut finished: Finished) -> Result<Ready, GpuError> {
-        match self {
-            Self::Host(_) => lists::gather(&mut finished, LIST_WIDTHS[0]),
-            #[cfg(feature = "cuda")]
-            Self::Nvidia(gpu) => gpu.prepare(&mut finished)?,
-        }
+    /// [`GpuError::Failed`].
+    pub fn prepare(&mut self, finished: Finished) -> Result<Ready, GpuError> {
         Ok(Ready {
-            finished,
             #[cfg(feature = "cuda")]
-            graph: None,
+            graph: match self {
+                Self::Host(_) => None,
+                Self::Nvidia(gpu) => gpu.capture(&finished)?,
+            },
+            finished,
         })
     }
 
-    /// Captures a program on a GPU, so that its first run costs what every run does.
+    /// Runs a program; on a GPU it may be under way when this returns.
     ///
     /// # Errors
     /// [`GpuError::Failed`].
-    pub fn capture(&mut self, program: &mut Ready) -> Result<(), GpuError> {
-        #[cfg(feature = "cuda")]
-        if let Self::Nvidia(gpu) = self {
-            program.graph = gpu.capture(&program.finished)?;
-        }
-        let _ = program;
-        Ok(())
-    }
-
-    /// Runs a program; on a GPU it is captured the first time and replayed from then on, and may be under way when this returns.
-    ///
-    /// # Errors
-    /// [`GpuError::Failed`].
-    pub fn run(&mut self, program: &mut Ready) -> Result<(), GpuError> {
+    pub fn run(&mut self, program: &Ready) -> Result<(), GpuError> {
         match self {
             Self::Host(host) => host.run(&program.finished),
             #[cfg(feature = "cuda")]
-            Self::Nvidia(gpu) => gpu.run(&program.finished, &mut program.graph)?,
+            Self::Nvidia(gpu) => gpu.run(program.graph.as_ref())?,
         }
         Ok(())
     }
@@ -263,7 +244,7 @@ impl Ready {
     /// Commands in it: kernels and matrix products.
     #[must_use]
     pub fn commands(&self) -> usize {
-        self.finished.items.iter().filter(|item| !matches!(item.command, Command::HandOver(_))).count()
+        self.finished.items.iter().filter(|item| item.command != Command::HandOver).count()
     }
 
     /// Memory of its buffers.
@@ -313,8 +294,7 @@ kernels! {
     ActorDraw actor_draw, ActorBackward actor_backward, LambdaReturns lambda_returns, ActorLoss actor_loss,
     ReturnRange return_range, Squares squares, Clip clip, Adam adam, Mix mix,
     NarrowForward narrow_forward, NarrowBackward narrow_backward,
-    ProductFewRows product_few_rows, ProductListed product_listed,
-    ProductFewRowsBack product_few_rows_back,
+    ProductFewRows product_few_rows, ProductFewRowsBack product_few_rows_back,
 }
 
 /// Arguments as kernels take them; the same in `kernels/common.h`.

@@ -1,7 +1,5 @@
 //! NVIDIA GPUs: kernels compiled by NVRTC when the machine is made, products by cuBLAS, programs as CUDA graphs.
 
-mod lists;
-
 use std::collections::HashMap;
 use std::ffi::c_void;
 use std::panic::{AssertUnwindSafe, catch_unwind};
@@ -21,7 +19,7 @@ use crate::program::{Command, Finished, Lane, Product};
 // SAFETY: plain numbers in C's layout, the same on host and device.
 unsafe impl DeviceRepr for Args {}
 
-const SOURCES: [&str; 11] = [
+const SOURCES: [&str; 10] = [
     include_str!("../../kernels/common.h"),
     include_str!("../../kernels/adam.c"),
     include_str!("../../kernels/categorical.c"),
@@ -32,7 +30,6 @@ const SOURCES: [&str; 11] = [
     include_str!("../../kernels/norm.c"),
     include_str!("../../kernels/product.c"),
     include_str!("../../kernels/rows.c"),
-    include_str!("../../kernels/lists.c"),
 ];
 
 /// Memory that cuBLAS works in: what NVIDIA recommends for Hopper.
@@ -45,10 +42,6 @@ pub struct Nvidia {
     blas: CudaBlas,
     side: (Arc<CudaStream>, CudaBlas),
     kernels: HashMap<Kernel, CudaFunction>,
-    /// What runs lists, where the GPU has clusters.
-    lists: Option<CudaFunction>,
-    /// The most shared memory that a block of it has.
-    list_shared_bytes: usize,
     memory: Vec<CudaSlice<u8>>,
     precision: Precision,
 }
@@ -127,8 +120,6 @@ impl Nvidia {
             let function = module.load_function(kernel.name()).map_err(failed("finding a kernel"))?;
             kernels.insert(*kernel, function);
         }
-        let lists = (major >= 9).then(|| module.load_function("run_lists"));
-        let lists = lists.transpose().map_err(failed("finding a kernel"))?;
         for kernel in [Kernel::InteractionForward, Kernel::InteractionBackward] {
             let most = context
                 .attribute(sys::CUdevice_attribute::CU_DEVICE_ATTRIBUTE_MAX_SHARED_MEMORY_PER_BLOCK_OPTIN)
@@ -142,8 +133,7 @@ impl Nvidia {
             |stream: &Arc<CudaStream>| CudaBlas::new(stream.clone()).map_err(failed("starting cuBLAS"));
         let beside = context.new_stream().map_err(failed("making a stream"))?;
         let (blas, side) = (start(&stream)?, (beside.clone(), start(&beside)?));
-        let mut machine =
-            Self { stream, blas, side, kernels, lists, list_shared_bytes: 0, memory: Vec::new(), precision };
+        let mut machine = Self { stream, blas, side, kernels, memory: Vec::new(), precision };
         for lane in [Lane::Main, Lane::Side] {
             machine.set_up_products(lane)?;
         }
@@ -170,7 +160,7 @@ impl Nvidia {
 
     fn lane(&self, lane: Lane) -> (&Arc<CudaStream>, &CudaBlas) {
         match lane {
-            Lane::Main | Lane::Twin => (&self.stream, &self.blas),
+            Lane::Main => (&self.stream, &self.blas),
             Lane::Side => (&self.side.0, &self.side.1),
         }
     }
@@ -207,10 +197,7 @@ impl Nvidia {
         self.stream.synchronize().map_err(failed("running a program"))
     }
 
-    pub(super) fn run(&mut self, program: &Finished, graph: &mut Option<Graph>) -> Result<(), GpuError> {
-        if graph.is_none() {
-            *graph = self.capture(program)?;
-        }
+    pub(super) fn run(&mut self, graph: Option<&Graph>) -> Result<(), GpuError> {
         match graph {
             Some(graph) => graph.0.launch().map_err(failed("launching a program")),
             None => Ok(()),
@@ -239,7 +226,7 @@ impl Nvidia {
             machine.stream.record_event(flags).map_err(failed("recording an event"))
         };
         let mut spans: Vec<(u16, CudaEvent)> = Vec::new();
-        for item in program.items.iter().filter(|item| !matches!(item.command, Command::HandOver(_))) {
+        for item in program.items.iter().filter(|item| item.command != Command::HandOver) {
             if spans.last().is_none_or(|(last, _)| *last != item.part) {
                 spans.push((item.part, event(self)?));
             }
@@ -262,7 +249,7 @@ impl Nvidia {
         const REPEATS: u32 = 20;
         let mut kinds: Vec<(String, &Command, usize, &'static str)> = Vec::new();
         let mut places: HashMap<String, usize> = HashMap::new();
-        for item in program.items.iter().filter(|item| !matches!(item.command, Command::HandOver(_))) {
+        for item in program.items.iter().filter(|item| item.command != Command::HandOver) {
             let command = &item.command;
             let name = describe(command);
             let part = program.parts[usize::from(item.part)];
@@ -309,15 +296,10 @@ impl Nvidia {
                     .map_err(|error| GpuError::Failed { what: kernel.name(), reason: format!("{error}") })?;
                 Ok(())
             }
-            Command::HandOver(to) => {
-                let other = self.lane(*to).0;
-                if Arc::ptr_eq(stream, other) {
-                    return Ok(());
-                }
+            Command::HandOver => {
                 let event = stream.record_event(None).map_err(failed("handing over"))?;
-                other.wait(&event).map_err(failed("handing over"))
+                self.lane(lane.other()).0.wait(&event).map_err(failed("handing over"))
             }
-            Command::Lists(lists) => self.launch_lists(lists),
             Command::Product(product) => self.multiply(product, lane),
         }
     }
@@ -364,11 +346,7 @@ impl Nvidia {
 /// A command by what its time depends on.
 fn describe(command: &Command) -> String {
     match command {
-        Command::HandOver(_) => String::new(),
-        Command::Lists(lists) => {
-            let phases: Vec<String> = lists.lists.iter().map(|list| list.len().to_string()).collect();
-            format!("lists of {} phases, {} blocks each", phases.join(" and "), lists.width)
-        }
+        Command::HandOver => String::new(),
         Command::Kernel { kernel, grid, n, .. } => {
             let sizes: Vec<String> = n.iter().take(3).map(i32::to_string).collect();
             format!("{} {}x{} {}", kernel.name(), grid.blocks, grid.threads, sizes.join(","))
