@@ -67,8 +67,9 @@ fn batch(rows: usize, length: usize, masks: bool) -> Batch {
         terminal: (0..steps).map(|step| step == 1).collect(),
         first,
         robot_mask,
+        masks,
         pushed: vec![false; steps],
-        number: 0,
+        ..HostBatch::default()
     };
     host.into_tensors(&Device::Cpu).unwrap()
 }
