@@ -7,14 +7,15 @@ use std::collections::BTreeMap;
 use candle_core::{Device, Tensor};
 use rand::{Rng, SeedableRng};
 use rand_chacha::ChaCha8Rng;
+use rcwm_gpu::learner::Images;
 use rcwm_gpu::weights::Array;
 use rcwm_gpu::{Machine, Precision};
 use rcwm_models::settings::{ModelKind, ModelSettings, Preset};
 use rcwm_models::{ACTION_LEN, IMAGE_BYTES, MASK_BYTES};
 use rcwm_trainer::behaviour::{BehaviourLearner, BehaviourSettings, Horizon};
 use rcwm_trainer::gpu::{GpuLearner, GpuPlan, numbered_noise};
-use rcwm_trainer::learning::{HostBatch, Trained, WorldLearner, WorldSettings};
-use rcwm_trainer::model::agent;
+use rcwm_trainer::learning::{HostBatch, Trained, WorldLearner, WorldSettings, world_losses};
+use rcwm_trainer::model::agent::{self, Agent};
 use rcwm_trainer::model::latent::Sampler;
 use rcwm_trainer::model::parameters::Parameters;
 use rcwm_trainer::parity::{self, Group};
@@ -219,6 +220,42 @@ fn what_lanes_compute_does_not_depend_on_how_they_meet() {
         let (late, _) = gradients_on(Machine::host_with_side_late(), kind);
         assert_eq!(found, late);
     }
+}
+
+#[test]
+fn a_batch_is_judged_by_the_average_that_a_checkpoint_holds() {
+    let model = ModelSettings::preset(Preset::Debug, ModelKind::Rcwm);
+    let world = WorldSettings::default();
+    let weights = lively_parameters(&model);
+    let plan = GpuPlan { average_decay: 0.9, ..plan(&model, &world, None) };
+    let mut gpu = GpuLearner::new(Machine::host(), &plan, &weights).unwrap();
+    for number in 0..4 {
+        gpu.update_world(&batch(ROWS, LENGTH, false, number), numbered_noise(SEED, number)).unwrap();
+    }
+    let host = batch(ROWS, LENGTH, false, 9);
+    let found = gpu.judge_world(&host, Images::Host(&host.image, &[]), numbered_noise(SEED, 9)).unwrap();
+    let tensors = host.clone().into_tensors(&Device::Cpu).unwrap();
+    let mut total_of = |array: Array| {
+        gpu.write_back(array, &weights).unwrap();
+        let agent = Agent::new(&weights.frozen(), &model).unwrap();
+        let mut sampler = Sampler::numbered(SEED, 9);
+        world_losses(&agent, &tensors, &world, &mut sampler).unwrap().values().unwrap().total
+    };
+    let (of_average, of_values) = (total_of(Array::Average), total_of(Array::Values));
+    close("total", found.total, of_average, 1e-5);
+    assert!(
+        (of_values - of_average).abs() > 1e-4 * of_average,
+        "{of_values} and {of_average} are too alike to tell"
+    );
+}
+
+#[test]
+fn sizes_that_kernels_do_not_take_are_refused_by_name() {
+    let model = ModelSettings { cnn_depth: 6, ..ModelSettings::preset(Preset::Debug, ModelKind::Rcwm) };
+    let weights = agent::initialise(&model, 1, &Device::Cpu).unwrap();
+    let world = WorldSettings::default();
+    let refused = GpuLearner::new(Machine::host(), &plan(&model, &world, None), &weights);
+    assert!(refused.unwrap_err().to_string().contains("cnn_depth = 6"));
 }
 
 #[test]

@@ -27,14 +27,16 @@ KERNEL(clip) {
 
 // One step of Adam on all parameters of an optimiser: w -= rate * m / (1 - b1^t) / (sqrt(v / (1 - b2^t)) + eps).
 // Each parameter begins at a multiple of 256, and `owner` says whose each run of 256 is.
+// Nothing moves where the factor of any of the program's optimisers is 0.
 // p: w, m, v, gradient, clip [norm, factor], owner (u32), table [parameters, 2] (rate / (1 - b1^t), 1 / (1 - b2^t)), average or null,
-// keep [1]. n: count. f: b1, b2, eps.
+// keep [1], clips of all optimisers. n: count, optimisers. f: b1, b2, eps.
 KERNEL(adam) {
     float *w = (float *)a.p[0], *m = (float *)a.p[1], *v = (float *)a.p[2], *average = (float *)a.p[7];
     const float *gradient = (const float *)a.p[3], *clip = (const float *)a.p[4], *table = (const float *)a.p[6];
     const u32 *owner = (const u32 *)a.p[5];
     float factor = clip[1];
-    if (factor == 0.0f) return;
+    for (int i = 0; i < a.n[1]; i++)
+        if (((const float *)a.p[9])[2 * i + 1] == 0.0f) return;
     FOR_ALL(i, a.n[0]) {
         const float *rates = table + 2 * owner[i / 256];
         float g = gradient[i] * factor;

@@ -17,7 +17,7 @@ typedef unsigned int u32;
 typedef unsigned char u8;
 
 #ifdef __CUDACC__
-// A kernel is a function of its own, and one that others call with blocks of their choice.
+// A kernel is its body, with the number of its block and of all, and its launch.
 #define KERNEL(name)                                                                                          \
     DEVICE void name##_in(const Args &a, int BLOCK, int BLOCKS);                                              \
     extern "C" __global__ void name(const __grid_constant__ Args a) { name##_in(a, (int)blockIdx.x, (int)gridDim.x); } \

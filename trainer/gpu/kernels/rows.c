@@ -111,16 +111,6 @@ KERNEL(transpose) {
     }
 }
 
-// a / max(1, |a|) of every number. p: x, y. n: rows, width, stride of x, of y.
-KERNEL(normalise_action) {
-    const float *x = (const float *)AT(0);
-    float *y = (float *)AT(1);
-    FOR_ALL(i, a.n[0] * a.n[1]) {
-        float value = x[i / a.n[1] * a.n[2] + i % a.n[1]];
-        y[i / a.n[1] * a.n[3] + i % a.n[1]] = value / fmaxf(1.0f, fabsf(value));
-    }
-}
-
 // out = factor * sum of x [count], each number raised to `floor` where n[1], by one block. p: x, out. n: count, floored. f: factor, floor.
 KERNEL(sum_of) {
     const float *x = (const float *)AT(0);

@@ -1,10 +1,15 @@
 //! The model's layers on a tape. Forward of an op and the way back stand together; gradients of weights are collected apart from it, so that a
 //! scan over time has one product a weight and not one a step: what collects is added before the scan and so runs after it backward.
 
+mod conv;
+mod interaction;
+
 use crate::machine::Kernel;
 use crate::program::{FEW_ROWS, Grid, Matrix, Pointer};
 use crate::tape::{Tape, chunks_of};
 use crate::weights::{Array, Weights};
+
+pub use interaction::{Attending, Interaction, Store};
 
 /// LayerNorm's epsilon everywhere but in the interaction model.
 const NORM_EPS: f32 = 1e-3;
@@ -12,8 +17,6 @@ const NORM_EPS: f32 = 1e-3;
 const INTERACTION_NORM_EPS: f32 = 1e-5;
 /// Blocks of a norm of narrow rows: what an H100 holds at once, twice.
 const NARROW_BLOCKS: usize = 132 * 8;
-/// Images whose windows are made at a time: their number must stay below 2^32, and they take 0.5 MB an image.
-const IMAGES_AT_A_TIME: usize = 1024;
 
 /// A parameter, with its gradient where it is trained.
 #[derive(Debug, Clone, Copy)]
@@ -83,18 +86,6 @@ impl Mlp {
     }
 }
 
-/// Robot to environment.
-#[derive(Debug, Clone, Copy)]
-pub struct Interaction {
-    /// h to k rows.
-    pub deter: Linear,
-    query: Linear,
-    key: Linear,
-    value: Linear,
-    output: Linear,
-    norm: Norm,
-}
-
 /// Parameters by name; those that `trains` accepts have gradients.
 #[derive(Clone, Copy)]
 pub struct Source<'a> {
@@ -102,6 +93,8 @@ pub struct Source<'a> {
     pub weights: &'a Weights,
     /// Which are trained.
     pub trains: fn(&str) -> bool,
+    /// The parameters themselves, or their average.
+    pub array: Array,
 }
 
 impl Source<'_> {
@@ -109,7 +102,7 @@ impl Source<'_> {
     #[must_use]
     pub fn weight(&self, name: &str) -> Weight {
         let gradient = (self.trains)(name).then(|| self.weights.matrix(Array::Gradients, name));
-        Weight { value: self.weights.matrix(Array::Values, name), gradient, transposed: None }
+        Weight { value: self.weights.matrix(self.array, name), gradient, transposed: None }
     }
 
     /// `NAME.weight` and `NAME.bias` of a norm.
@@ -430,166 +423,6 @@ impl Tape {
         }
         y
     }
-
-    /// The interaction of some rows: e [rows, n m] from z [rows, n m] and u [rows, (n+k) m].
-    pub fn interaction_step(&mut self, parts: &Interaction, classes: usize, at: Attending) {
-        let Attending { z, u, e, mix, sum, stats, store } = at;
-        let (m, parts) = (classes, *parts);
-        let (n, r) = (z.cols / m, u.cols / m);
-        let layers = [parts.query, parts.key, parts.value, parts.output];
-        let weights: Vec<Pointer> =
-            layers.iter().flat_map(|l| [l.weight.value.into(), l.bias.value.into()]).collect();
-        // As `layout` in `kernels/interaction.c` has it.
-        let (even, odd, across) = (m + 4, m + 1, r + 4);
-        let floats = (3 * n + r) * even + n * across + (4 * m + 2 * r) * odd + 4;
-        let threads = (n / 4 * m).next_multiple_of(32).clamp(256, 512);
-        let grid = Grid { blocks: z.rows, threads, shared_bytes: 4 * floats };
-        let norm = [parts.norm.gain.value, parts.norm.shift.value, e].map(Pointer::from);
-        let p =
-            [&[z.into(), u.into()][..], &weights, &norm, &[mix.into(), sum.into(), stats.into()]].concat();
-        let counts = [z.rows, n, r, m, z.stride, u.stride, e.stride];
-        self.program.kernel(Kernel::InteractionForward, grid, &p, &counts, &[parts.norm.eps]);
-        self.on_backward(move |tape| {
-            let de = tape.gradient_of(e);
-            let dz = tape.gradient_sum(z);
-            let du = tape.gradient_overwritten(u);
-            let floats = floats + (3 * n + 2 * r) * even + n * across;
-            let grid = Grid { shared_bytes: 4 * floats, ..grid };
-            let gradients = [parts.norm.gain.value, stats, de, dz, du].map(Pointer::from);
-            let store_at = store.map_or(Pointer::NULL, |store| store.at.pointer());
-            let p = [&[z.into(), u.into()][..], &weights, &gradients, &[store_at]].concat();
-            let distances = store.map_or([0; 3], |store| store.distances);
-            let n = [&[z.rows, n, r, m, z.stride, u.stride, de.stride, dz.stride, du.stride][..], &distances]
-                .concat();
-            tape.program.kernel(Kernel::InteractionBackward, grid, &p, &n, &[]);
-        });
-    }
-
-    /// Collects the gradients of the interaction's weights but `deter`'s over all rows.
-    pub fn collect_interaction(&mut self, parts: &Interaction, classes: usize, all: Attending) {
-        let (parts, m) = (*parts, classes);
-        let (Some(mix), Some(sum), Some(store)) = (all.mix, all.sum, all.store) else { return };
-        self.on_backward(move |tape| {
-            let (rows, n, r) = (all.z.rows, all.z.cols / m, all.u.cols / m);
-            let at = |distance: usize, rows: usize| Matrix {
-                offset: store.at.offset + distance,
-                rows,
-                cols: m,
-                stride: m,
-                ..store.at
-            };
-            let [q, k, v] = store.distances;
-            let flat = |x: Matrix| x.reshape(x.len() / m, m);
-            let (z, u) = (flat(all.z), flat(all.u));
-            let pairs = [
-                (parts.output, at(0, rows * n), flat(mix)),
-                (parts.query, at(q, rows * n), z),
-                (parts.key, at(k, rows * r), u),
-                (parts.value, at(v, rows * r), u),
-            ];
-            for (layer, d, x) in pairs {
-                let (Some(weight), Some(bias)) = (layer.weight.gradient, layer.bias.gradient) else {
-                    continue;
-                };
-                tape.product((d, true), (x, false), weight, true);
-                tape.add_column_sums(d, bias);
-            }
-            let de = tape.gradient_of(all.e);
-            tape.add_norm_gradients(flat(sum), parts.norm, all.stats, flat(de), false);
-        });
-    }
-
-    /// A convolution that halves the sides of x [images side side, channels], with norm and `SiLU`; `reaches` as in [`Tape::layer`].
-    pub fn conv_down(&mut self, x: Matrix, side: usize, weight: Weight, norm: Norm, reaches: bool) -> Matrix {
-        let (channels, out, half) = (x.cols, weight.value.rows, side / 2);
-        let images = x.rows / (side * side);
-        let pre = self.matrix(images * half * half, out);
-        for chunk in chunks(images) {
-            let windows = self.windows_of(x, side, &chunk);
-            let y = pre.rows(chunk.start * half * half..chunk.end * half * half);
-            self.product((windows, false), (weight.value, true), y, false);
-        }
-        self.on_backward(move |tape| {
-            let d_pre = tape.gradient_of(pre);
-            let dx = reaches.then(|| tape.gradient_term(x));
-            for chunk in chunks(images) {
-                let dy = d_pre.rows(chunk.start * half * half..chunk.end * half * half);
-                if let Some(gradient) = weight.gradient {
-                    let windows = tape.windows_of(x, side, &chunk);
-                    tape.product((dy, true), (windows, false), gradient, true);
-                }
-                if let Some((dx, add)) = dx {
-                    let d_windows = tape.matrix(dy.rows, 16 * channels);
-                    tape.product((dy, false), (weight.value, false), d_windows, false);
-                    let rows = chunk.start * side * side..chunk.end * side * side;
-                    tape.add_up_windows(d_windows, dx.rows(rows), side, None, add);
-                }
-            }
-        });
-        let y = self.matrix(pre.rows, out);
-        self.norm(pre, norm, y, true);
-        y
-    }
-
-    /// A transposed convolution that doubles the sides of x [images side side, channels]: its sums, before norm and activation.
-    pub fn conv_up(&mut self, x: Matrix, side: usize, weight: Weight, bias: Option<Weight>) -> Matrix {
-        let (out, twice) = (weight.value.cols / 16, 2 * side);
-        let images = x.rows / (side * side);
-        let y = self.matrix(images * twice * twice, out);
-        let parts = move |chunk: &std::ops::Range<usize>| {
-            (
-                chunk.start * side * side..chunk.end * side * side,
-                chunk.start * twice * twice..chunk.end * twice * twice,
-            )
-        };
-        for chunk in chunks(images) {
-            let (small, large) = parts(&chunk);
-            let windows = self.matrix(small.len(), 16 * out);
-            self.product((x.rows(small), false), (weight.value, false), windows, false);
-            self.add_up_windows(windows, y.rows(large), twice, bias, false);
-        }
-        self.on_backward(move |tape| {
-            let dy = tape.gradient_of(y);
-            let (dx, add) = tape.gradient_term(x);
-            for chunk in chunks(images) {
-                let (small, _) = parts(&chunk);
-                let windows = tape.windows_of(dy, twice, &chunk);
-                if let Some(gradient) = weight.gradient {
-                    tape.product((x.rows(small.clone()), true), (windows, false), gradient, true);
-                }
-                tape.product((windows, false), (weight.value, true), dx.rows(small), add);
-            }
-            if let Some(gradient) = bias.and_then(|bias| bias.gradient) {
-                tape.add_column_sums(dy, gradient);
-            }
-        });
-        y
-    }
-
-    fn windows_of(&mut self, x: Matrix, side: usize, images: &std::ops::Range<usize>) -> Matrix {
-        let (channels, half) = (x.cols, side / 2);
-        let windows = self.matrix(images.len() * half * half, 16 * channels);
-        let x = x.rows(images.start * side * side..images.end * side * side);
-        let n = [images.len(), side, channels];
-        self.program.kernel(
-            Kernel::Windows,
-            Grid::elements(windows.len()),
-            &[x.into(), windows.into()],
-            &n,
-            &[],
-        );
-        windows
-    }
-
-    fn add_up_windows(&mut self, windows: Matrix, x: Matrix, side: usize, bias: Option<Weight>, add: bool) {
-        let p = [windows.into(), x.into(), bias.map(|bias| bias.value).into()];
-        let n = [x.rows / (side * side), side, x.cols, usize::from(add)];
-        self.program.kernel(Kernel::FromWindows, Grid::elements(x.len() / 4), &p, &n, &[]);
-    }
-}
-
-fn chunks(images: usize) -> impl Iterator<Item = std::ops::Range<usize>> {
-    (0..images).step_by(IMAGES_AT_A_TIME).map(move |from| from..(from + IMAGES_AT_A_TIME).min(images))
 }
 
 /// How categoricals are drawn.
@@ -603,32 +436,4 @@ pub struct Draw {
     pub major: Option<(usize, usize)>,
     /// Whether the gradient passes through log p, as that of the initial state's mode does, and not through p.
     pub of_mode: bool,
-}
-
-/// Rows of the interaction: inputs, output, and what the weights' gradients need.
-#[derive(Debug, Clone, Copy)]
-pub struct Attending {
-    /// Environment's z_{t-1} [rows, n m].
-    pub z: Matrix,
-    /// Robot's prior z_t and k rows of its h_t [rows, (n+k) m].
-    pub u: Matrix,
-    /// Features e_{t-1} [rows, n m].
-    pub e: Matrix,
-    /// Mixtures [rows, n m], where the weights are trained.
-    pub mix: Option<Matrix>,
-    /// Sums before the norm [rows, n m], likewise.
-    pub sum: Option<Matrix>,
-    /// Of the norm [rows n, 2].
-    pub stats: Matrix,
-    /// Gradients inside, likewise.
-    pub store: Option<Store>,
-}
-
-/// Where the interaction's gradients lie for its weights: of the sum before the norm, then q, k and v.
-#[derive(Debug, Clone, Copy)]
-pub struct Store {
-    /// All, with this row's part of the sums first.
-    pub at: Matrix,
-    /// From this row's part of the sums to those of q, k and v, in numbers.
-    pub distances: [usize; 3],
 }

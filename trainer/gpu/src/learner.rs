@@ -1,12 +1,14 @@
 //! World model, actor and critic on one machine: weights, optimisers, and the programs that update them.
 
-use crate::behaviour::{self, BehaviourScales, Sources};
-use crate::layers::Source;
-use crate::machine::{CommandTime, GpuError, Kernel, Machine, PartTime, Ready};
-use crate::program::{Arena, Grid, Matrix, Pointer, Program};
-use crate::tape::Tape;
+mod programs;
+
+use crate::behaviour::{self, BehaviourScales};
+use crate::machine::{CommandTime, GpuError, Machine, PartTime, Ready};
+use crate::program::Matrix;
 use crate::weights::{Array, Group, Weights};
-use crate::world::{self, Inputs, Sizes, WorldScales};
+use crate::world::{self, Sizes, WorldScales};
+
+use programs::{Optimiser, Programs, Room, check};
 
 /// Adam with clipping by the global norm.
 #[derive(Debug, Clone, Copy, PartialEq)]
@@ -96,6 +98,8 @@ pub struct WorldValues {
     pub total: f64,
     /// Norm of the gradients before clipping.
     pub gradient_norm: f64,
+    /// Whether the parameters moved: all losses and gradients were finite.
+    pub moved: bool,
 }
 
 /// What an update of actor and critic was.
@@ -119,37 +123,8 @@ pub struct BehaviourValues {
     pub value: f64,
     /// The returns' running range.
     pub range: [f64; 2],
-}
-
-/// An optimiser's place on the machine.
-#[derive(Debug, Clone, Copy)]
-struct Optimiser {
-    group: Group,
-    scales: AdamScales,
-    table: u64,
-    clip: u64,
-}
-
-/// Room that is uploaded and downloaded.
-#[derive(Debug, Clone, Copy)]
-struct Room {
-    inputs: Inputs,
-    batch_images: u64,
-    batch_masks: u64,
-    features: Matrix,
-    scalars: Matrix,
-    behaviour_scalars: Matrix,
-    range: Matrix,
-    keep: u64,
-}
-
-/// The programs of a learner.
-#[derive(Debug)]
-struct Programs {
-    world: Ready,
-    masked: Ready,
-    judge: Ready,
-    behaviour: Option<Ready>,
+    /// Whether the parameters moved: all losses and gradients were finite. Where not, the slow critic and the range have moved all the same.
+    pub moved: bool,
 }
 
 /// World model, actor and critic on a machine.
@@ -163,18 +138,6 @@ pub struct Learner {
     /// Steps of every parameter's optimiser, in the weights' order.
     steps: Vec<u64>,
     programs: Programs,
-}
-
-fn is_world(name: &str) -> bool {
-    !(name.starts_with("actor.") || is_critic(name) || name.starts_with("slow_critic."))
-}
-
-fn is_actor(name: &str) -> bool {
-    name.starts_with("actor.")
-}
-
-fn is_critic(name: &str) -> bool {
-    name.starts_with("critic.")
 }
 
 impl Learner {
@@ -192,14 +155,14 @@ impl Learner {
         let weights = Weights::new(&mut machine, specs, bins, settings.sizes.model.deter)?;
         let room = Room::new(&mut machine, &settings)?;
         let mut optimisers = Vec::new();
-        let optimiser = |machine: &mut Machine, group, scales| {
-            let table = machine.allocate(8 * weights.entries().len())?;
-            Ok::<_, GpuError>(Optimiser { group, scales, table, clip: machine.allocate(8)? })
-        };
-        optimisers.push(optimiser(&mut machine, Group::World, settings.world_adam)?);
+        let mut wanted = vec![(Group::World, settings.world_adam)];
         if let Some((_, actor, critic)) = settings.behaviour {
-            optimisers.push(optimiser(&mut machine, Group::Actor, actor)?);
-            optimisers.push(optimiser(&mut machine, Group::Critic, critic)?);
+            wanted.extend([(Group::Actor, actor), (Group::Critic, critic)]);
+        }
+        let clips = machine.allocate(8 * wanted.len())?;
+        for (at, (group, scales)) in wanted.into_iter().enumerate() {
+            let table = machine.allocate(8 * weights.entries().len())?;
+            optimisers.push(Optimiser { group, scales, table, clip: clips + 8 * at as u64 });
         }
         let programs = Programs::new(&mut machine, &weights, &settings, room, &optimisers)?;
         let steps = vec![0; weights.entries().len()];
@@ -301,7 +264,7 @@ impl Learner {
         let program = if batch.masks { &self.programs.masked } else { &self.programs.world };
         self.machine.run(program)?;
         let values = self.world_values(batch.masks)?;
-        if values.total.is_finite() && values.gradient_norm.is_finite() {
+        if values.moved {
             self.count_step(0);
         }
         Ok(values)
@@ -334,12 +297,10 @@ impl Learner {
         let mut range = [0f32; 2];
         self.machine.download(address(self.room.range), &mut range)?;
         let [actor_loss, critic_loss, entropy, reward, lambda_return, value] = scalars.map(f64::from);
-        let mut norm = |which: usize| {
-            let mut clip = [0f32; 2];
-            self.machine.download(self.optimisers[which].clip, &mut clip)?;
-            Ok::<_, GpuError>(f64::from(clip[0]))
-        };
-        let (actor_gradient_norm, critic_gradient_norm) = (norm(1)?, norm(2)?);
+        let mut clips = [[0f32; 2]; 2];
+        self.machine.download(self.optimisers[1].clip, clips.as_flattened_mut())?;
+        let [actor_gradient_norm, critic_gradient_norm] = clips.map(|clip| f64::from(clip[0]));
+        let moved = clips.iter().all(|clip| clip[1] != 0.0);
         let values = BehaviourValues {
             actor_loss,
             critic_loss,
@@ -350,8 +311,9 @@ impl Learner {
             lambda_return,
             value,
             range: range.map(f64::from),
+            moved,
         };
-        if actor_gradient_norm.is_finite() && critic_gradient_norm.is_finite() {
+        if moved {
             self.count_step(1);
             self.count_step(2);
         }
@@ -464,7 +426,11 @@ impl Learner {
 
         let Room { inputs, batch_images, batch_masks, .. } = self.room;
         let index: Vec<u32> = match batch.images {
-            Images::Stored(places) if places.len() == rows && self.settings.stored_images > 0 => {
+            Images::Stored(places)
+                if places.len() == rows
+                    && places.iter().all(|place| (*place as usize) < self.settings.stored_images)
+                    && (!batch.masks || self.settings.stored_masks) =>
+            {
                 (0..rows).map(|row| places[from(row)]).collect()
             }
             Images::Host(images, masks)
@@ -516,7 +482,17 @@ impl Learner {
         }
         let robot_mask = masks.then_some(mask);
         let gradient_norm = f64::from(clip[0]);
-        Ok(WorldValues { image, robot_mask, reward, continues, kl: [first, second], total, gradient_norm })
+        let moved = clip[1] != 0.0;
+        Ok(WorldValues {
+            image,
+            robot_mask,
+            reward,
+            continues,
+            kl: [first, second],
+            total,
+            gradient_norm,
+            moved,
+        })
     }
 }
 
@@ -525,163 +501,4 @@ fn address(matrix: Matrix) -> u64 {
         crate::program::Place::Fixed(address) => address,
         crate::program::Place::Transient(_) => unreachable!("a room has fixed places alone"),
     }
-}
-
-fn check(settings: &LearnerSettings) -> Result<(), GpuError> {
-    let Sizes { model, length, paint_every, .. } = &settings.sizes;
-    let refuse = |text: String| Err(GpuError::Unsupported(text));
-    if *paint_every == 0 || !length.is_multiple_of(*paint_every) {
-        return refuse(format!(
-            "world.paint_every = {paint_every} does not divide replay.length = {length}, as updates on a GPU need"
-        ));
-    }
-    if model.classes > 32 || model.categoricals > 64 {
-        return refuse(format!(
-            "{} categoricals of {} classes; updates on a GPU take at most 64 of 32",
-            model.categoricals, model.classes
-        ));
-    }
-    let rows = [model.categoricals, model.classes, model.interaction_rows()];
-    if settings.sizes.branches() == 2 && rows.iter().any(|rows| !rows.is_multiple_of(4)) {
-        return refuse(format!(
-            "{} categoricals of {} classes and a width of {}; on a GPU the interaction takes multiples of 4 rows (categoricals, \
-             classes, width / classes)",
-            model.categoricals, model.classes, model.deter
-        ));
-    }
-    if settings.behaviour.is_some_and(|(scales, ..)| scales.length < 2) {
-        return refuse("behaviour.horizon.length must be at least 2".to_owned());
-    }
-    Ok(())
-}
-
-impl Room {
-    fn new(machine: &mut Machine, settings: &LearnerSettings) -> Result<Self, GpuError> {
-        let sizes = &settings.sizes;
-        let rows = sizes.rows();
-        let stored = settings.stored_images > 0;
-        let images = if stored { settings.stored_images } else { rows };
-        let masks = if !stored || settings.stored_masks { images } else { 1 };
-        let (images, masks) = (machine.allocate(images * 12288)?, machine.allocate(masks * 4096)?);
-        let mut words = |count: usize| machine.allocate(4 * count);
-        let inputs = Inputs {
-            images,
-            masks,
-            index: words(rows)?,
-            shift: words(2 * sizes.batch)?,
-            action: words(rows * sizes.model.action)?,
-            reward: words(rows)?,
-            terminal: words(rows)?,
-            first: words(rows)?,
-            painted: words(rows)?,
-            noise: words(10)?,
-            kl: words(2 * rows)?,
-        };
-        Ok(Self {
-            inputs,
-            batch_images: images,
-            batch_masks: masks,
-            features: Matrix::fixed(words(rows * sizes.state())?, rows, sizes.state()),
-            scalars: Matrix::fixed(words(world::SCALARS)?, 1, world::SCALARS),
-            behaviour_scalars: Matrix::fixed(words(behaviour::SCALARS)?, 1, behaviour::SCALARS),
-            range: Matrix::fixed(words(2)?, 1, 2),
-            keep: words(1)?,
-        })
-    }
-}
-
-impl Programs {
-    fn new(
-        machine: &mut Machine,
-        weights: &Weights,
-        settings: &LearnerSettings,
-        room: Room,
-        optimisers: &[Optimiser],
-    ) -> Result<Self, GpuError> {
-        let world = |masks: bool, learns: bool| {
-            let mut tape = Tape::default();
-            let trains: fn(&str) -> bool = if learns { is_world } else { |_| false };
-            let source = Source { weights, trains };
-            if learns {
-                tape.program.part("optimiser");
-                tape.zero(weights.group(Array::Gradients, Group::World));
-            }
-            let parts = (settings.world, masks);
-            let out = (room.features, room.scalars);
-            if learns {
-                world::losses(&mut tape, source, &settings.sizes, room.inputs, parts, out);
-                let average = (settings.average_decay > 0.0).then_some(room.keep);
-                step(&mut tape, weights, optimisers[0], room.scalars, average);
-            } else {
-                let sizes = &settings.sizes;
-                tape.without_gradient(|tape| world::losses(tape, source, sizes, room.inputs, parts, out));
-            }
-            tape.program
-        };
-        let behaviour = settings.behaviour.map(|(scales, ..)| {
-            let mut tape = Tape::default();
-            tape.program.part("optimiser");
-            for group in [Group::Actor, Group::Critic] {
-                tape.zero(weights.group(Array::Gradients, group));
-            }
-            let values = |group| weights.group(Array::Values, group);
-            let (critic, slow) = (values(Group::Critic), values(Group::SlowCritic));
-            let p = [critic, slow].map(Pointer::from);
-            tape.program.kernel(
-                Kernel::Mix,
-                Grid::elements(critic.len()),
-                &p,
-                &[critic.len()],
-                &[scales.slow_share],
-            );
-            let source = |trains: fn(&str) -> bool| Source { weights, trains };
-            let sources =
-                Sources { frozen: source(|_| false), actor: source(is_actor), critic: source(is_critic) };
-            let noise = (room.inputs.noise, settings.sizes.words());
-            let out = (room.range, room.behaviour_scalars);
-            behaviour::losses(&mut tape, sources, &settings.sizes, &scales, room.features, noise, out);
-            for optimiser in &optimisers[1..] {
-                step(&mut tape, weights, *optimiser, room.behaviour_scalars, None);
-            }
-            tape.program
-        });
-        let programs: Vec<Program> = [world(false, true), world(true, true), world(false, false)]
-            .into_iter()
-            .chain(behaviour)
-            .collect();
-        let layouts: Vec<_> = programs.iter().map(Program::layout).collect();
-        let bytes = layouts.iter().map(|(_, bytes)| *bytes).max().unwrap_or_default();
-        let arena = Arena::new(machine, bytes)?;
-        let mut ready = programs
-            .into_iter()
-            .zip(layouts)
-            .map(|(program, (offsets, bytes))| machine.prepare(program.finish(&offsets, bytes, &arena)));
-        let mut next = || ready.next().expect("there are as many as were built");
-        let (world, masked, judge) = (next()?, next()?, next()?);
-        Ok(Self { world, masked, judge, behaviour: ready.next().transpose()? })
-    }
-}
-
-/// Adds the clipping by the norm and one step of Adam.
-fn step(tape: &mut Tape, weights: &Weights, optimiser: Optimiser, scalars: Matrix, keep: Option<u64>) {
-    const RUN: usize = 16_384;
-    tape.program.part("optimiser");
-    let Optimiser { group, scales, table, clip } = optimiser;
-    let array = |array: Array| weights.group(array, group);
-    let gradient = array(Array::Gradients);
-    let (count, clip) = (gradient.len(), Matrix::fixed(clip, 1, 2));
-    let blocks = count.div_ceil(RUN);
-    let partial = tape.matrix(1, blocks);
-    let grid = Grid { blocks, threads: 512, shared_bytes: 0 };
-    tape.program.kernel(Kernel::Squares, grid, &[gradient.into(), partial.into()], &[count, RUN], &[]);
-    let p = [partial, scalars, clip].map(Pointer::from);
-    let grid = Grid { blocks: 1, threads: 512, shared_bytes: 0 };
-    tape.program.kernel(Kernel::Clip, grid, &p, &[blocks, scalars.len()], &[scales.clip_norm]);
-    let fixed = |address: u64| Pointer::from(Matrix::fixed(address, 1, 1));
-    let arrays =
-        [Array::Values, Array::First, Array::Second, Array::Gradients].map(|a| Pointer::from(array(a)));
-    let average = keep.map_or([Pointer::NULL; 2], |keep| [array(Array::Average).into(), fixed(keep)]);
-    let p = [&arrays[..], &[clip.into(), fixed(weights.owners(group)), fixed(table)], &average].concat();
-    let f = [scales.beta1 as f32, scales.beta2 as f32, scales.eps];
-    tape.program.kernel(Kernel::Adam, Grid::elements(count), &p, &[count], &f);
 }

@@ -371,8 +371,7 @@ impl Program {
         self.items.push(Item { part: self.part, lane: self.lane, command });
     }
 
-    /// Gives every buffer an address: buffers whose first and last uses do not overlap share memory. `arena` grows where it is too small,
-    /// so all programs of an arena must be finished before the first one is run.
+    /// Where every buffer lies in an arena, and the arena's bytes: buffers whose first and last uses do not overlap share memory.
     pub fn layout(&self) -> (Vec<usize>, usize) {
         let mut lives: Vec<Option<(usize, usize)>> = vec![None; self.sizes.len()];
         for (at, item) in self.items.iter().enumerate() {

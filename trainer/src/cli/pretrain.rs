@@ -67,8 +67,15 @@ impl Pretrain {
         } else {
             self.seeds.iter().map(|seed| (self.out.join(format!("seed-{seed}")), Some(*seed))).collect()
         };
+        let distinct: std::collections::BTreeSet<_> = self.seeds.iter().collect();
+        anyhow::ensure!(
+            distinct.len() == self.seeds.len(),
+            "--seeds: every seed once, each is a run of its own"
+        );
+        let sets_seed = self.overrides.iter().any(|change| change.trim_start().starts_with("seed="));
+        anyhow::ensure!(!sets_seed || self.seeds.is_empty(), "--set seed=... beside --seeds: leave one out");
         let stop = super::stop_on_ctrl_c()?;
-        let mut settings = Vec::with_capacity(outs.len());
+        let mut settings: Vec<TrainingSettings> = Vec::with_capacity(outs.len());
         for (out, seed) in &outs {
             if !self.resume && out.join("settings.toml").exists() {
                 return Err(TrainingError::Exists { path: out.clone() }.into());
@@ -79,6 +86,14 @@ impl Pretrain {
             settings.push(resolved);
         }
         let Some(first) = settings.first() else { anyhow::bail!("--seeds: expected at least one") };
+        let same = |other: &TrainingSettings| {
+            (&other.data, &other.masks, other.replay.capacity_steps)
+                == (&first.data, &first.masks, first.replay.capacity_steps)
+        };
+        anyhow::ensure!(
+            settings.iter().all(same),
+            "the runs of --seeds learn from different data; resume them one by one"
+        );
         let replay = load(first)?;
         let mut runs = Vec::with_capacity(outs.len());
         for ((out, _), settings) in outs.iter().zip(settings) {
@@ -96,11 +111,16 @@ impl Pretrain {
                 .into_iter()
                 .map(|(out, mut training, bar)| {
                     let (bar, replay, stop) = (bars.add(bar), replay.clone(), &*stop);
+                    let name = match out.file_name() {
+                        Some(name) if !self.seeds.is_empty() => format!("{}: ", name.to_string_lossy()),
+                        _ => String::new(),
+                    };
                     bar.set_position(training.updates());
                     bar.reset_eta();
                     scope.spawn(move || {
                         let mut shown = Instant::now();
-                        let outcome = training.run(replay, stop, |progress| show(&bar, &mut shown, progress));
+                        let outcome =
+                            training.run(replay, stop, |progress| show(&bar, &name, &mut shown, progress));
                         // Whatever ends one run ends the others where they are, with a checkpoint each.
                         if outcome.is_err() {
                             stop.store(true, Ordering::Relaxed);
@@ -115,19 +135,29 @@ impl Pretrain {
                 .map(|thread| thread.join().map_err(|_| anyhow::anyhow!("a run's thread panicked")))
                 .collect::<Result<Vec<_>>>()
         })?;
+        let mut failed = None;
         for (out, outcome) in outcomes {
-            let (outcome, out) = (outcome?, out.as_path());
-            if outcome.interrupted {
-                println!(
-                    "stopped and saved after {} updates; go on with --resume --out {}",
-                    outcome.updates,
-                    self.out.display()
-                );
-            } else {
-                println!("{} updates; checkpoint in {}", outcome.updates, Run::last(out).display());
+            match outcome {
+                Ok(outcome) if outcome.interrupted => {
+                    println!("stopped and saved after {} updates; {}", outcome.updates, self.go_on());
+                }
+                Ok(outcome) => {
+                    println!("{} updates; checkpoint in {}", outcome.updates, Run::last(out).display());
+                }
+                Err(error) => failed = Some(anyhow::Error::from(error).context(out.display().to_string())),
             }
         }
-        Ok(ExitCode::SUCCESS)
+        match failed {
+            None => Ok(ExitCode::SUCCESS),
+            Some(error) => Err(error),
+        }
+    }
+
+    /// How a run that was stopped goes on.
+    fn go_on(&self) -> String {
+        let seeds: Vec<String> = self.seeds.iter().map(u64::to_string).collect();
+        let seeds = if seeds.is_empty() { String::new() } else { format!(" --seeds {}", seeds.join(",")) };
+        format!("go on with --resume --out {}{seeds}", self.out.display())
     }
 
     /// The settings of a new run, or those of the run to be resumed; with the overrides.
@@ -174,17 +204,17 @@ fn load(settings: &TrainingSettings) -> Result<Replay> {
 /// Without a terminal, time between two lines.
 const LINE_EVERY: Duration = Duration::from_secs(10);
 
-fn show(bar: &ProgressBar, shown: &mut Instant, progress: &Progress<'_>) {
+fn show(bar: &ProgressBar, name: &str, shown: &mut Instant, progress: &Progress<'_>) {
     bar.set_position(progress.updates);
     if let (true, Some(metrics), true) = (bar.is_hidden(), progress.metrics, shown.elapsed() >= LINE_EVERY) {
         *shown = Instant::now();
         let (done, all) = (progress.updates, bar.length().unwrap_or_default());
-        println!("{done} of {all} updates, ETA {:.0?}  {}", bar.eta(), describe(metrics));
+        println!("{name}{done} of {all} updates, ETA {:.0?}  {}", bar.eta(), describe(metrics));
     }
     if let Some(HeldOutLosses { update, held_out, best }) = progress.held_out {
         let best = if *best { ", the best so far" } else { "" };
         bar.println(format!(
-            "{update} updates: held-out loss {:.1}, image {:.1}{best}",
+            "{name}{update} updates: held-out loss {:.1}, image {:.1}{best}",
             held_out.total, held_out.image
         ));
     }

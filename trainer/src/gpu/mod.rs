@@ -237,6 +237,7 @@ impl GpuLearner {
             })?;
         finite("the loss", values.total)?;
         finite("the norm of the gradients", values.gradient_norm)?;
+        moved(values.moved)?;
         Ok(GpuWorldUpdate { losses: self.losses(values), gradient_norm: values.gradient_norm })
     }
 
@@ -267,6 +268,7 @@ impl GpuLearner {
         let BehaviourValues { actor_gradient_norm, critic_gradient_norm, range: [low, high], .. } = values;
         finite("the norm of the actor's gradients", actor_gradient_norm)?;
         finite("the norm of the critic's gradients", critic_gradient_norm)?;
+        moved(values.moved)?;
         let range = ReturnRange { low, high };
         let update = BehaviourUpdate {
             actor_loss: values.actor_loss,
@@ -320,6 +322,11 @@ fn on_gpu<'a>(batch: &'a HostBatch, images: Images<'a>, shift: &'a [[i32; 2]]) -
         number: batch.number,
         shift,
     }
+}
+
+/// Where something that the host does not see was not finite, nothing moved.
+fn moved(moved: bool) -> Result<(), LearningError> {
+    if moved { Ok(()) } else { Err(LearningError::NotFinite { what: "a loss", value: f64::NAN }) }
 }
 
 fn finite(what: &'static str, value: f64) -> Result<(), LearningError> {

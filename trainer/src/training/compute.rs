@@ -58,7 +58,7 @@ pub(super) enum WorldUpdates {
     },
     /// The programs are laid out when the replay is known.
     Waiting {
-        machine: Machine,
+        machine: Option<Machine>,
         adam: Adam,
     },
     Programs {
@@ -85,7 +85,7 @@ impl WorldUpdates {
             }
             Compute::Programs(machine) => {
                 let adam = adam.unwrap_or_else(|| Adam::new(settings.world.adam.clone()));
-                Self::Waiting { machine, adam }
+                Self::Waiting { machine: Some(machine), adam }
             }
         })
     }
@@ -99,9 +99,10 @@ impl WorldUpdates {
         replays: [&mut Replay; 2],
     ) -> Result<(), TrainingError> {
         let (machine, adam) = match self {
-            Self::Waiting { machine, adam } => (std::mem::replace(machine, Machine::host()), adam.clone()),
+            Self::Waiting { machine, adam } => (machine.take(), adam.clone()),
             Self::Tensors { .. } | Self::Programs { .. } => return Ok(()),
         };
+        let Some(machine) = machine else { return Err(TrainingError::NoMachine) };
         let mut steps = 0;
         let mut episodes: Vec<(u32, Arc<Episode>)> = Vec::new();
         for replay in replays {

@@ -44,6 +44,8 @@ pub struct Finetuning {
     run: Run,
     parameters: Parameters,
     updates: AgentUpdates,
+    /// Updates that the weights which act have seen.
+    acting_since: u64,
     state: TrainingState,
     newest: VecDeque<bool>,
     refused_actions: u64,
@@ -101,6 +103,7 @@ impl Finetuning {
             run,
             parameters,
             updates,
+            acting_since: state.updates,
             state,
             newest: VecDeque::new(),
             refused_actions: 0,
@@ -182,7 +185,10 @@ impl Finetuning {
         let replay = SharedReplay::new(filled.replay);
         let mut learning = Learning { batches: self.prefetch(&replay)?, interval: Interval::begin() };
         let done = self.work(&replay, &mut learning, join, stop, &mut show);
-        self.updates.write_back(&self.parameters)?;
+        // What ended the work says more than what fails after it.
+        if let Err(error) = self.write_back() {
+            return Err(done.err().unwrap_or(error));
+        }
         // Whatever happened: a model with a number that is not finite is never saved.
         check_finite(&self.parameters)?;
         self.save()?;
@@ -306,9 +312,6 @@ impl Finetuning {
             let phase = self.update(learning)?;
             self.state.updates += 1;
             let updates = self.state.updates;
-            if updates.is_multiple_of(self.settings.finetune.acting_weights_every) || updates == due {
-                self.updates.write_back(&self.parameters)?;
-            }
             let mut line = updates
                 .is_multiple_of(self.settings.metrics_every)
                 .then(|| learning.interval.end(updates, phase));
@@ -323,6 +326,11 @@ impl Finetuning {
                 self.save()?;
             }
             show(&OnlineProgress { line: line.as_ref(), ..self.progress() });
+        }
+        // The policy acts next.
+        let since = self.state.updates.saturating_sub(self.acting_since);
+        if since >= self.settings.finetune.acting_weights_every || self.state.policy_steps == 0 {
+            self.write_back()?;
         }
         Ok(())
     }
@@ -340,6 +348,11 @@ impl Finetuning {
         }
         interval.update(&values);
         Ok(if warm_up { "warm_up" } else { ONLINE })
+    }
+
+    fn write_back(&mut self) -> Result<(), TrainingError> {
+        self.acting_since = self.state.updates;
+        self.updates.write_back(&self.parameters)
     }
 
     fn prefetch(&self, replay: &SharedReplay) -> Result<Prefetch, TrainingError> {
@@ -369,7 +382,7 @@ impl Finetuning {
 
     /// Saves a checkpoint; it is the best if the newest episodes had the highest success rate of all checkpoints, the first of equals.
     fn save(&mut self) -> Result<(), TrainingError> {
-        self.updates.write_back(&self.parameters)?;
+        self.write_back()?;
         self.state.return_range = self.updates.return_range();
         let full = self.newest.len() == self.settings.finetune.success_episodes;
         let success = self.success_rate().filter(|_| full);

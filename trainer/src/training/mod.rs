@@ -86,6 +86,9 @@ use std::path::PathBuf;
 /// Why a run ended early.
 #[derive(Debug, thiserror::Error)]
 pub enum TrainingError {
+    /// An earlier try could not set up the GPU and gave it back.
+    #[error("the GPU was given back when setting up failed; start the run again")]
+    NoMachine,
     /// The folder holds a run.
     #[error("{path} holds a run already; say --resume, or choose another folder")]
     Exists {

@@ -224,6 +224,9 @@ impl FinetuneSettings {
 
     pub(super) fn validate(&self) -> Result<(), SettingsError> {
         let invalid = |text: String| Err(SettingsError::Invalid(text));
+        if self.acting_weights_every == 0 {
+            return invalid("finetune.acting_weights_every = 0, expected at least 1".to_owned());
+        }
         if !self.train_ratio.is_finite() || self.train_ratio < 0.0 {
             return invalid(format!("finetune.train_ratio = {}, expected at least 0", self.train_ratio));
         }

@@ -30,7 +30,6 @@ impl Host {
     }
 
     pub(super) fn allocate(&mut self, bytes: usize) -> u64 {
-        // Poisoned, so that what is read before it is written shows; callers that need zeros upload them.
         let block = vec![0u64; bytes.div_ceil(8)];
         let address = block.as_ptr() as u64;
         self.memory.push(block);

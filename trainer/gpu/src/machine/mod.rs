@@ -246,12 +246,6 @@ impl Ready {
     pub fn commands(&self) -> usize {
         self.finished.items.iter().filter(|item| item.command != Command::HandOver).count()
     }
-
-    /// Memory of its buffers.
-    #[must_use]
-    pub fn bytes(&self) -> usize {
-        self.finished.bytes
-    }
 }
 
 macro_rules! kernels {
@@ -287,7 +281,7 @@ kernels! {
     ColumnSums column_sums, SumPartials sum_partials, CellForward cell_forward, CellBackward cell_backward,
     Draw draw, DrawBackward draw_backward, BalancedKl balanced_kl,
     FillRows fill_rows, CopyRows copy_rows, GatherRows gather_rows, Zero zero, Tanh tanh_of,
-    Carry carry, CarryBackward carry_backward, Transpose transpose, NormaliseAction normalise_action, SumOf sum_of, Noise noise,
+    Carry carry, CarryBackward carry_backward, Transpose transpose, SumOf sum_of, Noise noise,
     InteractionForward interaction_forward, InteractionBackward interaction_backward,
     Windows windows, FromWindows from_windows, GatherImages gather_images, PictureLoss picture_loss,
     TwoHotLoss two_hot_loss, TwoHotMean two_hot_mean, ContinueLoss continue_loss, ScaledSigmoid scaled_sigmoid,

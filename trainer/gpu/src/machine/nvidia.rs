@@ -96,6 +96,8 @@ fn compiled(architecture: &str) -> Result<Ptx, GpuError> {
 impl Nvidia {
     pub(super) fn new(ordinal: usize, precision: Precision) -> Result<Self, GpuError> {
         // Libraries that are not there make cudarc panic; that is no reason to print a backtrace.
+        static ONE: Mutex<()> = Mutex::new(());
+        let _one = ONE.lock().unwrap_or_else(PoisonError::into_inner);
         let hook = std::panic::take_hook();
         std::panic::set_hook(Box::new(|_| {}));
         let made = catch_unwind(AssertUnwindSafe(|| Self::make(ordinal, precision)));
@@ -109,7 +111,7 @@ impl Nvidia {
 
     fn make(ordinal: usize, precision: Precision) -> Result<Self, GpuError> {
         let context = CudaContext::new(ordinal).map_err(|error| GpuError::Unavailable(format!("{error}")))?;
-        // SAFETY: everything runs on one stream, in order; no event has to guard memory.
+        // SAFETY: memory is only used by the two streams, which meet where programs hand over and at their end; no event has to guard it.
         unsafe { context.disable_event_tracking() };
         let stream = context.new_stream().map_err(failed("making a stream"))?;
         let (major, minor) = context.compute_capability().map_err(failed("asking for the architecture"))?;

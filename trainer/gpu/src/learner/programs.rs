@@ -1,0 +1,227 @@
+//! What a learner has on its machine: room for batches and results, optimisers, and the programs.
+
+use super::{AdamScales, LearnerSettings};
+use crate::behaviour::{self, Sources};
+use crate::layers::Source;
+use crate::machine::{GpuError, Kernel, Machine, Ready};
+use crate::program::{Arena, Grid, Matrix, Pointer, Program};
+use crate::tape::Tape;
+use crate::weights::{Array, Group, Weights};
+use crate::world::{self, Inputs, Sizes};
+
+/// An optimiser's place on the machine.
+#[derive(Debug, Clone, Copy)]
+pub(super) struct Optimiser {
+    pub(super) group: Group,
+    pub(super) scales: AdamScales,
+    pub(super) table: u64,
+    pub(super) clip: u64,
+}
+
+/// Room that is uploaded and downloaded.
+#[derive(Debug, Clone, Copy)]
+pub(super) struct Room {
+    pub(super) inputs: Inputs,
+    pub(super) batch_images: u64,
+    pub(super) batch_masks: u64,
+    pub(super) features: Matrix,
+    pub(super) scalars: Matrix,
+    pub(super) behaviour_scalars: Matrix,
+    pub(super) range: Matrix,
+    pub(super) keep: u64,
+}
+
+/// The programs of a learner.
+#[derive(Debug)]
+pub(super) struct Programs {
+    pub(super) world: Ready,
+    pub(super) masked: Ready,
+    pub(super) judge: Ready,
+    pub(super) behaviour: Option<Ready>,
+}
+
+fn is_world(name: &str) -> bool {
+    !(name.starts_with("actor.") || is_critic(name) || name.starts_with("slow_critic."))
+}
+
+fn is_actor(name: &str) -> bool {
+    name.starts_with("actor.")
+}
+
+fn is_critic(name: &str) -> bool {
+    name.starts_with("critic.")
+}
+
+pub(super) fn check(settings: &LearnerSettings) -> Result<(), GpuError> {
+    let Sizes { model, length, paint_every, .. } = &settings.sizes;
+    let refuse = |text: String| Err(GpuError::Unsupported(text));
+    if *paint_every == 0 || !length.is_multiple_of(*paint_every) {
+        return refuse(format!(
+            "world.paint_every = {paint_every} does not divide replay.length = {length}, as updates on a GPU need"
+        ));
+    }
+    if !model.cnn_depth.is_multiple_of(4) {
+        return refuse(format!(
+            "model.cnn_depth = {}; updates on a GPU take a multiple of 4, or run on the CPU",
+            model.cnn_depth
+        ));
+    }
+    if model.classes > 32 || model.categoricals > 64 {
+        return refuse(format!(
+            "{} categoricals of {} classes; updates on a GPU take at most 64 of 32",
+            model.categoricals, model.classes
+        ));
+    }
+    let rows = [model.categoricals, model.classes, model.interaction_rows()];
+    if settings.sizes.branches() == 2 && rows.iter().any(|rows| !rows.is_multiple_of(4)) {
+        return refuse(format!(
+            "{} categoricals of {} classes and a width of {}; on a GPU the interaction takes multiples of 4 rows (categoricals, \
+             classes, width / classes)",
+            model.categoricals, model.classes, model.deter
+        ));
+    }
+    if settings.behaviour.is_some_and(|(scales, ..)| scales.length < 2) {
+        return refuse("behaviour.horizon.length must be at least 2".to_owned());
+    }
+    Ok(())
+}
+
+impl Room {
+    pub(super) fn new(machine: &mut Machine, settings: &LearnerSettings) -> Result<Self, GpuError> {
+        let sizes = &settings.sizes;
+        let rows = sizes.rows();
+        let stored = settings.stored_images > 0;
+        let images = if stored { settings.stored_images } else { rows };
+        let masks = if !stored || settings.stored_masks { images } else { 1 };
+        let (images, masks) = (machine.allocate(images * 12288)?, machine.allocate(masks * 4096)?);
+        let mut words = |count: usize| machine.allocate(4 * count);
+        let inputs = Inputs {
+            images,
+            masks,
+            index: words(rows)?,
+            shift: words(2 * sizes.batch)?,
+            action: words(rows * sizes.model.action)?,
+            reward: words(rows)?,
+            terminal: words(rows)?,
+            first: words(rows)?,
+            painted: words(rows)?,
+            noise: words(10)?,
+            kl: words(2 * rows)?,
+        };
+        Ok(Self {
+            inputs,
+            batch_images: images,
+            batch_masks: masks,
+            features: Matrix::fixed(words(rows * sizes.state())?, rows, sizes.state()),
+            scalars: Matrix::fixed(words(world::SCALARS)?, 1, world::SCALARS),
+            behaviour_scalars: Matrix::fixed(words(behaviour::SCALARS)?, 1, behaviour::SCALARS),
+            range: Matrix::fixed(words(2)?, 1, 2),
+            keep: words(1)?,
+        })
+    }
+}
+
+impl Programs {
+    pub(super) fn new(
+        machine: &mut Machine,
+        weights: &Weights,
+        settings: &LearnerSettings,
+        room: Room,
+        optimisers: &[Optimiser],
+    ) -> Result<Self, GpuError> {
+        let world = |masks: bool, learns: bool| {
+            let mut tape = Tape::default();
+            let trains: fn(&str) -> bool = if learns { is_world } else { |_| false };
+            // What is judged is what a checkpoint holds.
+            let averaged = !learns && settings.average_decay > 0.0;
+            let array = if averaged { Array::Average } else { Array::Values };
+            let source = Source { weights, trains, array };
+            if learns {
+                tape.program.part("optimiser");
+                tape.zero(weights.group(Array::Gradients, Group::World));
+            }
+            let parts = (settings.world, masks);
+            let out = (room.features, room.scalars);
+            if learns {
+                world::losses(&mut tape, source, &settings.sizes, room.inputs, parts, out);
+                let average = (settings.average_decay > 0.0).then_some(room.keep);
+                step(&mut tape, weights, &optimisers[..1], room.scalars, average);
+            } else {
+                let sizes = &settings.sizes;
+                tape.without_gradient(|tape| world::losses(tape, source, sizes, room.inputs, parts, out));
+            }
+            tape.program
+        };
+        let behaviour = settings.behaviour.map(|(scales, ..)| {
+            let mut tape = Tape::default();
+            tape.program.part("optimiser");
+            for group in [Group::Actor, Group::Critic] {
+                tape.zero(weights.group(Array::Gradients, group));
+            }
+            let values = |group| weights.group(Array::Values, group);
+            let (critic, slow) = (values(Group::Critic), values(Group::SlowCritic));
+            let p = [critic, slow].map(Pointer::from);
+            tape.program.kernel(
+                Kernel::Mix,
+                Grid::elements(critic.len()),
+                &p,
+                &[critic.len()],
+                &[scales.slow_share],
+            );
+            let source = |trains: fn(&str) -> bool| Source { weights, trains, array: Array::Values };
+            let sources =
+                Sources { frozen: source(|_| false), actor: source(is_actor), critic: source(is_critic) };
+            let noise = (room.inputs.noise, settings.sizes.words());
+            let out = (room.range, room.behaviour_scalars);
+            behaviour::losses(&mut tape, sources, &settings.sizes, &scales, room.features, noise, out);
+            step(&mut tape, weights, &optimisers[1..], room.behaviour_scalars, None);
+            tape.program
+        });
+        let programs: Vec<Program> = [world(false, true), world(true, true), world(false, false)]
+            .into_iter()
+            .chain(behaviour)
+            .collect();
+        let layouts: Vec<_> = programs.iter().map(Program::layout).collect();
+        let bytes = layouts.iter().map(|(_, bytes)| *bytes).max().unwrap_or_default();
+        let arena = Arena::new(machine, bytes)?;
+        let mut ready = programs
+            .into_iter()
+            .zip(layouts)
+            .map(|(program, (offsets, bytes))| machine.prepare(program.finish(&offsets, bytes, &arena)));
+        let mut next = || ready.next().expect("there are as many as were built");
+        let (world, masked, judge) = (next()?, next()?, next()?);
+        Ok(Self { world, masked, judge, behaviour: ready.next().transpose()? })
+    }
+}
+
+/// Adds the clipping by their norms and one step of Adam for optimisers whose clips lie one after the other: all move, or none does.
+fn step(tape: &mut Tape, weights: &Weights, optimisers: &[Optimiser], scalars: Matrix, keep: Option<u64>) {
+    const RUN: usize = 16_384;
+    tape.program.part("optimiser");
+    let clip = |optimiser: &Optimiser| Matrix::fixed(optimiser.clip, 1, 2);
+    for optimiser in optimisers {
+        let gradient = weights.group(Array::Gradients, optimiser.group);
+        let (count, blocks) = (gradient.len(), gradient.len().div_ceil(RUN));
+        let partial = tape.matrix(1, blocks);
+        let grid = Grid { blocks, threads: 512, shared_bytes: 0 };
+        tape.program.kernel(Kernel::Squares, grid, &[gradient.into(), partial.into()], &[count, RUN], &[]);
+        let p = [partial, scalars, clip(optimiser)].map(Pointer::from);
+        let grid = Grid { blocks: 1, threads: 512, shared_bytes: 0 };
+        let most = optimiser.scales.clip_norm;
+        tape.program.kernel(Kernel::Clip, grid, &p, &[blocks, scalars.len()], &[most]);
+    }
+    let fixed = |address: u64| Pointer::from(Matrix::fixed(address, 1, 1));
+    for optimiser in optimisers {
+        let Optimiser { group, scales, table, .. } = *optimiser;
+        let array = |array: Array| weights.group(array, group);
+        let count = array(Array::Values).len();
+        let arrays =
+            [Array::Values, Array::First, Array::Second, Array::Gradients].map(|a| Pointer::from(array(a)));
+        let average = keep.map_or([Pointer::NULL; 2], |keep| [array(Array::Average).into(), fixed(keep)]);
+        let own = [clip(optimiser).into(), fixed(weights.owners(group)), fixed(table)];
+        let all = fixed(optimisers[0].clip);
+        let p = [&arrays[..], &own, &average, &[all]].concat();
+        let f = [scales.beta1 as f32, scales.beta2 as f32, scales.eps];
+        tape.program.kernel(Kernel::Adam, Grid::elements(count), &p, &[count, optimisers.len()], &f);
+    }
+}
