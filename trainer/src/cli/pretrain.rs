@@ -94,10 +94,10 @@ impl Pretrain {
             settings.iter().all(same),
             "the runs of --seeds learn from different data; resume them one by one"
         );
+        let computes = outs.iter().map(|_| self.compute.compute()).collect::<Result<Vec<_>>>()?;
         let replay = load(first)?;
         let mut runs = Vec::with_capacity(outs.len());
-        for ((out, _), settings) in outs.iter().zip(settings) {
-            let compute = self.compute.compute()?;
+        for (((out, _), settings), compute) in outs.iter().zip(settings).zip(computes) {
             let training = if self.resume {
                 Pretraining::resume(out, settings.clone(), compute)?
             } else {

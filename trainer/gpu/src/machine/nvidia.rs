@@ -105,6 +105,8 @@ impl Nvidia {
         made.unwrap_or_else(|panic| {
             let text =
                 panic.downcast_ref::<String>().cloned().unwrap_or_else(|| "a library is missing".to_owned());
+            // What follows is a list of all names that were tried.
+            let text = text.split(" - searched").next().unwrap_or_default();
             Err(GpuError::Unavailable(text.lines().next().unwrap_or_default().to_owned()))
         })
     }
