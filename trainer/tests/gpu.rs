@@ -2,6 +2,8 @@
 
 #![allow(clippy::unwrap_used)]
 
+mod support;
+
 use std::collections::BTreeMap;
 
 use candle_core::{Device, Tensor};
@@ -17,22 +19,10 @@ use rcwm_trainer::gpu::{GpuLearner, GpuPlan, numbered_noise};
 use rcwm_trainer::learning::{HostBatch, Trained, WorldLearner, WorldSettings, world_losses};
 use rcwm_trainer::model::agent::{self, Agent};
 use rcwm_trainer::model::latent::Sampler;
-use rcwm_trainer::model::parameters::Parameters;
 use rcwm_trainer::parity::{self, Group};
+use support::lively_parameters;
 
 const SEED: u64 = 11;
-
-/// Parameters away from their start, where the layers that begin at 0 let gradients through.
-fn lively_parameters(model: &ModelSettings) -> Parameters {
-    let parameters = agent::initialise(model, 1, &Device::Cpu).unwrap();
-    let mut generator = ChaCha8Rng::seed_from_u64(2);
-    for (_, var) in parameters.iter() {
-        let noise: Vec<f32> = (0..var.elem_count()).map(|_| generator.random_range(-0.05..0.05)).collect();
-        let noise = Tensor::from_vec(noise, var.dims(), &Device::Cpu).unwrap();
-        var.set(&(var.as_tensor() + noise).unwrap().detach()).unwrap();
-    }
-    parameters
-}
 
 fn batch(rows: usize, length: usize, masks: bool, number: u64) -> HostBatch {
     let mut generator = ChaCha8Rng::seed_from_u64(3 + number);
@@ -223,7 +213,7 @@ fn what_lanes_compute_does_not_depend_on_how_they_meet() {
 }
 
 #[test]
-fn a_batch_is_judged_by_the_average_that_a_checkpoint_holds() {
+fn validation_is_of_the_average_that_a_checkpoint_holds() {
     let model = ModelSettings::preset(Preset::Debug, ModelKind::Rcwm);
     let world = WorldSettings::default();
     let weights = lively_parameters(&model);
@@ -233,7 +223,7 @@ fn a_batch_is_judged_by_the_average_that_a_checkpoint_holds() {
         gpu.update_world(&batch(ROWS, LENGTH, false, number), numbered_noise(SEED, number)).unwrap();
     }
     let host = batch(ROWS, LENGTH, false, 9);
-    let found = gpu.judge_world(&host, Images::Host(&host.image, &[]), numbered_noise(SEED, 9)).unwrap();
+    let found = gpu.validate_world(&host, Images::Host(&host.image, &[]), numbered_noise(SEED, 9)).unwrap();
     let tensors = host.clone().into_tensors(&Device::Cpu).unwrap();
     let mut total_of = |array: Array| {
         gpu.write_back(array, &weights).unwrap();

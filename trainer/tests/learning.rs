@@ -2,6 +2,8 @@
 
 #![allow(clippy::unwrap_used)]
 
+mod support;
+
 use std::path::Path;
 
 use candle_core::{Device, Tensor};
@@ -19,6 +21,7 @@ use rcwm_trainer::model::latent::Sampler;
 use rcwm_trainer::model::parameters::Parameters;
 use rcwm_trainer::ops;
 use rcwm_trainer::parity::{self, Group};
+use support::lively_parameters;
 
 /// A softmax does not see what is added to all of its inputs: the true gradient of the keys' bias is 0.
 const BLIND: &str = "interaction.key.bias";
@@ -35,18 +38,6 @@ fn one_update_of_the_authors_implementation_is_ours_in_every_number() {
 
 /// The actor learns with the world model.
 const IMITATION: Imitation = Imitation { scale: 10.0, loss: CloningLoss::SquaredError, learning_rate: 1e-3 };
-
-/// Parameters away from their start, where the layers that begin at 0 let gradients through.
-fn lively_parameters(model: &ModelSettings) -> Parameters {
-    let parameters = agent::initialise(model, 1, &Device::Cpu).unwrap();
-    let mut generator = ChaCha8Rng::seed_from_u64(2);
-    for (_, var) in parameters.iter() {
-        let noise: Vec<f32> = (0..var.elem_count()).map(|_| generator.random_range(-0.05..0.05)).collect();
-        let noise = Tensor::from_vec(noise, var.dims(), &Device::Cpu).unwrap();
-        var.set(&(var.as_tensor() + noise).unwrap().detach()).unwrap();
-    }
-    parameters
-}
 
 fn batch(rows: usize, length: usize, masks: bool) -> Batch {
     let mut generator = ChaCha8Rng::seed_from_u64(3);

@@ -40,7 +40,7 @@ struct Arguments {
     growth: u32,
     /// Where updates run: cpu, or cuda (the first NVIDIA GPU)
     #[arg(long, value_enum, default_value = "cpu")]
-    device: Place,
+    device: DeviceKind,
     /// Precision of matrix products on a GPU
     #[arg(long, value_delimiter = ',', value_enum, default_value = "f32")]
     precision: Vec<Products>,
@@ -59,7 +59,7 @@ struct Arguments {
 }
 
 #[derive(Debug, Clone, Copy, PartialEq, Eq, ValueEnum)]
-enum Place {
+enum DeviceKind {
     Cpu,
     Cuda,
 }
@@ -117,7 +117,7 @@ fn main() -> ExitCode {
 
 fn run(arguments: &Arguments) -> Result<()> {
     let mut results = Results { sizes: Vec::new(), growth: Vec::new(), gpu: Vec::new() };
-    if arguments.device == Place::Cuda {
+    if arguments.device == DeviceKind::Cuda {
         on_gpu(arguments, &mut results)?;
         return write(arguments, &results);
     }

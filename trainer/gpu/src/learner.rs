@@ -274,9 +274,9 @@ impl Learner {
     ///
     /// # Errors
     /// [`GpuError::Failed`].
-    pub fn judge_world(&mut self, batch: &Batch<'_>, noise: Noise) -> Result<WorldValues, GpuError> {
+    pub fn validate_world(&mut self, batch: &Batch<'_>, noise: Noise) -> Result<WorldValues, GpuError> {
         self.upload(batch, noise)?;
-        self.machine.run(&self.programs.judge)?;
+        self.machine.run(&self.programs.validation)?;
         let values = self.world_values(false)?;
         Ok(WorldValues { gradient_norm: 0.0, ..values })
     }
@@ -498,7 +498,7 @@ impl Learner {
 
 fn address(matrix: Matrix) -> u64 {
     match matrix.place {
-        crate::program::Place::Fixed(address) => address,
-        crate::program::Place::Transient(_) => unreachable!("a room has fixed places alone"),
+        crate::program::Buffer::Fixed(address) => address,
+        crate::program::Buffer::Transient(_) => unreachable!("a room has fixed places alone"),
     }
 }

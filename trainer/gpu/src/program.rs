@@ -6,7 +6,7 @@ use crate::machine::{GpuError, Kernel, Machine};
 
 /// A place in memory.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Hash)]
-pub enum Place {
+pub enum Buffer {
     /// An address that outlives programs.
     Fixed(u64),
     /// A buffer of a program, given an address when the program is finished.
@@ -17,7 +17,7 @@ pub enum Place {
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct Matrix {
     /// Its buffer.
-    pub place: Place,
+    pub place: Buffer,
     /// Where it begins in the buffer, in numbers.
     pub offset: usize,
     /// Rows.
@@ -32,7 +32,7 @@ impl Matrix {
     /// A contiguous matrix at an address.
     #[must_use]
     pub fn fixed(address: u64, rows: usize, cols: usize) -> Self {
-        Self { place: Place::Fixed(address), offset: 0, rows, cols, stride: cols }
+        Self { place: Buffer::Fixed(address), offset: 0, rows, cols, stride: cols }
     }
 
     /// Some of its rows.
@@ -85,7 +85,7 @@ impl Matrix {
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct Pointer {
     /// The buffer.
-    pub place: Option<Place>,
+    pub place: Option<Buffer>,
     /// Distance from its begin.
     pub bytes: usize,
 }
@@ -282,10 +282,10 @@ const ALIGNMENT: usize = 256;
 
 impl Program {
     /// A buffer of this many numbers; its contents are undefined until something is written.
-    pub fn buffer(&mut self, numbers: usize) -> Place {
+    pub fn buffer(&mut self, numbers: usize) -> Buffer {
         assert!(numbers < 1 << 31, "kernels count a buffer's numbers in 32 bits");
         self.sizes.push((4 * numbers).next_multiple_of(ALIGNMENT));
-        Place::Transient(self.sizes.len() as u32 - 1)
+        Buffer::Transient(self.sizes.len() as u32 - 1)
     }
 
     /// Commands from now on belong to this part.
@@ -376,7 +376,7 @@ impl Program {
         let mut lives: Vec<Option<(usize, usize)>> = vec![None; self.sizes.len()];
         for (at, item) in self.items.iter().enumerate() {
             each_place(&item.command, |place| {
-                if let Place::Transient(id) = place {
+                if let Buffer::Transient(id) = place {
                     let life = lives[id as usize].get_or_insert((at, at));
                     life.1 = at;
                 }
@@ -421,9 +421,9 @@ impl Program {
     #[must_use]
     pub fn finish(self, offsets: &[usize], bytes: usize, arena: &Arena) -> Finished {
         assert!(bytes <= arena.bytes, "the arena was made for smaller programs");
-        let fix = |place: Place| match place {
-            Place::Fixed(address) => Place::Fixed(address),
-            Place::Transient(id) => Place::Fixed(arena.address + offsets[id as usize] as u64),
+        let fix = |place: Buffer| match place {
+            Buffer::Fixed(address) => Buffer::Fixed(address),
+            Buffer::Transient(id) => Buffer::Fixed(arena.address + offsets[id as usize] as u64),
         };
         let matrix = |m: Matrix| Matrix { place: fix(m.place), ..m };
         let items = self.items.into_iter().map(|item| {
@@ -453,7 +453,7 @@ impl Arena {
     }
 }
 
-fn each_place(command: &Command, mut look: impl FnMut(Place)) {
+fn each_place(command: &Command, mut look: impl FnMut(Buffer)) {
     match command {
         Command::Kernel { p, .. } => p.iter().filter_map(|p| p.place).for_each(look),
         Command::HandOver => (),
@@ -470,7 +470,7 @@ mod tests {
         let mut program = Program::default();
         let [a, b, c] = [program.buffer(1000), program.buffer(1000), program.buffer(1000)];
         let m = |place| Matrix { place, offset: 0, rows: 10, cols: 100, stride: 100 };
-        let copy = |program: &mut Program, x: Place, y: Place| {
+        let copy = |program: &mut Program, x: Buffer, y: Buffer| {
             program.kernel(Kernel::CopyRows, Grid::elements(1000), &[m(x).into(), m(y).into()], &[], &[]);
         };
         copy(&mut program, a, b);

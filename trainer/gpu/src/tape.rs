@@ -4,7 +4,7 @@ use std::collections::HashMap;
 use std::ops::Range;
 
 use crate::machine::Kernel;
-use crate::program::{Grid, Lane, Matrix, Place, Pointer, Product, Program};
+use crate::program::{Buffer, Grid, Lane, Matrix, Pointer, Product, Program};
 
 type Backward = Box<dyn FnOnce(&mut Tape)>;
 
@@ -13,15 +13,15 @@ type Backward = Box<dyn FnOnce(&mut Tape)>;
 pub struct Tape {
     /// The commands so far.
     pub program: Program,
-    sizes: HashMap<Place, usize>,
-    gradients: HashMap<Place, Gradient>,
+    sizes: HashMap<Buffer, usize>,
+    gradients: HashMap<Buffer, Gradient>,
     backward: Vec<(&'static str, Lane, Backward)>,
     detached: bool,
 }
 
 /// A gradient's buffer, and which of its numbers have been written: disjoint ranges in order.
 struct Gradient {
-    place: Place,
+    place: Buffer,
     written: Vec<Range<usize>>,
 }
 
@@ -122,7 +122,7 @@ impl Tape {
         self.on_backward(|tape| tape.program.fork());
     }
 
-    fn gradient(&mut self, place: Place) -> &mut Gradient {
+    fn gradient(&mut self, place: Buffer) -> &mut Gradient {
         let Self { program, sizes, gradients, .. } = self;
         gradients.entry(place).or_insert_with(|| {
             let numbers = sizes.get(&place).copied().expect("only matrices of the tape have gradients");

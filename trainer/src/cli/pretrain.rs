@@ -3,7 +3,7 @@ use std::process::ExitCode;
 use std::sync::atomic::Ordering;
 use std::time::{Duration, Instant};
 
-use anyhow::Result;
+use anyhow::{Context, Result};
 use indicatif::{MultiProgress, ProgressBar, ProgressStyle};
 use rcwm_models::settings;
 use rcwm_trainer::replay::{Folder, Replay};
@@ -99,10 +99,11 @@ impl Pretrain {
         let mut runs = Vec::with_capacity(outs.len());
         for (((out, _), settings), compute) in outs.iter().zip(settings).zip(computes) {
             let training = if self.resume {
-                Pretraining::resume(out, settings.clone(), compute)?
+                Pretraining::resume(out, settings.clone(), compute)
             } else {
-                Pretraining::create(out, settings.clone(), compute)?
+                Pretraining::create(out, settings.clone(), compute)
             };
+            let training = training.with_context(|| out.display().to_string())?;
             runs.push((out, training, bars::updates(settings.pretrain.updates, 0)));
         }
         let bars = MultiProgress::new();

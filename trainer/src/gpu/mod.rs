@@ -245,13 +245,13 @@ impl GpuLearner {
     ///
     /// # Errors
     /// [`LearningError`].
-    pub fn judge_world(
+    pub fn validate_world(
         &mut self,
         batch: &HostBatch,
         images: Images<'_>,
         noise: Noise,
     ) -> Result<LossValues, LearningError> {
-        let values = self.learner.judge_world(&on_gpu(batch, images, &[]), noise)?;
+        let values = self.learner.validate_world(&on_gpu(batch, images, &[]), noise)?;
         Ok(self.losses(values))
     }
 

@@ -44,7 +44,7 @@ impl Compute {
 
 /// What one update of the world model said.
 #[derive(Debug, Clone, Copy)]
-pub(super) struct Made {
+pub(super) struct WorldStep {
     pub losses: LossValues,
     pub gradient_norm: f64,
 }
@@ -129,24 +129,24 @@ impl WorldUpdates {
     }
 
     /// One update from a batch with the noise of this number.
-    pub fn update(&mut self, batch: HostBatch, seed: u64, number: u64) -> Result<Made, TrainingError> {
+    pub fn update(&mut self, batch: HostBatch, seed: u64, number: u64) -> Result<WorldStep, TrainingError> {
         match self {
             Self::Tensors { learner, device } => {
                 let batch = batch.into_tensors(device)?;
                 let update = learner.update(&batch, &mut Sampler::numbered(seed, number))?;
-                Ok(Made { losses: update.losses, gradient_norm: update.gradient_norm })
+                Ok(WorldStep { losses: update.losses, gradient_norm: update.gradient_norm })
             }
             Self::Programs { learner } => {
                 let images = Images::Stored(&batch.place);
                 let update = learner.update_world_from(&batch, images, &[], numbered_noise(seed, number))?;
-                Ok(Made { losses: update.losses, gradient_norm: update.gradient_norm })
+                Ok(WorldStep { losses: update.losses, gradient_norm: update.gradient_norm })
             }
             Self::Waiting { .. } => unreachable!("a run begins before it updates"),
         }
     }
 
     /// The losses of a batch, where the programs run; none where the trainer's own model must be asked.
-    pub fn judge(
+    pub fn validate(
         &mut self,
         batch: &HostBatch,
         seed: u64,
@@ -154,7 +154,7 @@ impl WorldUpdates {
     ) -> Result<Option<LossValues>, TrainingError> {
         let Self::Programs { learner } = self else { return Ok(None) };
         let images = Images::Stored(&batch.place);
-        Ok(Some(learner.judge_world(batch, images, numbered_noise(seed, number))?))
+        Ok(Some(learner.validate_world(batch, images, numbered_noise(seed, number))?))
     }
 
     /// Brings the weights to `parameters`, and their average to the run's, before a checkpoint; the optimiser as it is now.
@@ -240,28 +240,28 @@ impl AgentUpdates {
         batch: HostBatch,
         (seed, number): (u64, u64),
         behaves: bool,
-    ) -> Result<(Made, Option<BehaviourUpdate>), TrainingError> {
+    ) -> Result<(WorldStep, Option<BehaviourUpdate>), TrainingError> {
         match self {
             Self::Tensors { world, behaviour, device } => {
                 let batch = batch.into_tensors(device)?;
                 let mut sampler = Sampler::numbered(seed, number);
                 let update = world.update(&batch, &mut sampler)?;
-                let made = Made { losses: update.losses, gradient_norm: update.gradient_norm };
+                let step = WorldStep { losses: update.losses, gradient_norm: update.gradient_norm };
                 if !behaves {
-                    return Ok((made, None));
+                    return Ok((step, None));
                 }
                 let start = update.posteriors.map(|x| x.flatten(0, 1))?; // [B*T, ...]
-                Ok((made, Some(behaviour.update(&start, &mut sampler)?)))
+                Ok((step, Some(behaviour.update(&start, &mut sampler)?)))
             }
             Self::Programs { learner, range } => {
                 let update = learner.update_world(&batch, numbered_noise(seed, number))?;
-                let made = Made { losses: update.losses, gradient_norm: update.gradient_norm };
+                let step = WorldStep { losses: update.losses, gradient_norm: update.gradient_norm };
                 if !behaves {
-                    return Ok((made, None));
+                    return Ok((step, None));
                 }
                 let (behaviour, now) = learner.update_behaviour()?;
                 *range = now;
-                Ok((made, Some(behaviour)))
+                Ok((step, Some(behaviour)))
             }
         }
     }

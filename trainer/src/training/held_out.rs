@@ -41,7 +41,7 @@ impl HeldOut {
         let mut found = Vec::with_capacity(sizes.held_out_batches);
         for number in 0..sizes.held_out_batches as u64 {
             let batch = self.replay.draw(sizes.batch, sizes.length, false, self.seed, number)?;
-            if let Some(losses) = updates.judge(&batch, self.seed, number)? {
+            if let Some(losses) = updates.validate(&batch, self.seed, number)? {
                 found.push(losses);
                 continue;
             }

@@ -4,7 +4,7 @@ use std::time::Instant;
 
 use candle_core::Device;
 
-use super::compute::{Compute, Made, WorldUpdates};
+use super::compute::{Compute, WorldStep, WorldUpdates};
 use super::film::{Scene, write_films};
 use super::held_out::{HeldOut, mean_losses};
 use super::run::GoesOn;
@@ -243,7 +243,7 @@ struct Means {
 }
 
 impl Means {
-    fn add(&mut self, update: &Made) {
+    fn add(&mut self, update: &WorldStep) {
         self.losses.push((update.losses, update.gradient_norm));
     }
 

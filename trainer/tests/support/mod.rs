@@ -4,7 +4,9 @@
 
 use std::path::PathBuf;
 
-use candle_core::Device;
+use candle_core::{Device, Tensor};
+use rand::{Rng, SeedableRng};
+use rand_chacha::ChaCha8Rng;
 use rcwm_models::settings::{ModelKind, ModelSettings, Preset};
 use rcwm_trainer::checkpoint::{self, Checkpoint, CheckpointSettings};
 use rcwm_trainer::model::agent;
@@ -52,4 +54,16 @@ pub fn assert_full_scale(name: &str, weight: &[f32]) {
     let spread = (weight.iter().map(|x| f64::from(*x).powi(2)).sum::<f64>() / weight.len() as f64).sqrt();
     assert!((0.8..1.2).contains(&(spread / std)), "{name}: spread {spread}, expected about {std}");
     assert!(weight.iter().all(|x| f64::from(x.abs()) <= 2.0 * std / 0.8796 + 1e-6), "{name}");
+}
+
+/// Parameters away from their start, where the layers that begin at 0 let gradients through.
+pub fn lively_parameters(model: &ModelSettings) -> Parameters {
+    let parameters = agent::initialise(model, 1, &Device::Cpu).unwrap();
+    let mut generator = ChaCha8Rng::seed_from_u64(2);
+    for (_, var) in parameters.iter() {
+        let noise: Vec<f32> = (0..var.elem_count()).map(|_| generator.random_range(-0.05..0.05)).collect();
+        let noise = Tensor::from_vec(noise, var.dims(), &Device::Cpu).unwrap();
+        var.set(&(var.as_tensor() + noise).unwrap().detach()).unwrap();
+    }
+    parameters
 }

@@ -36,7 +36,7 @@ pub(super) struct Room {
 pub(super) struct Programs {
     pub(super) world: Ready,
     pub(super) masked: Ready,
-    pub(super) judge: Ready,
+    pub(super) validation: Ready,
     pub(super) behaviour: Option<Ready>,
 }
 
@@ -132,7 +132,7 @@ impl Programs {
         let world = |masks: bool, learns: bool| {
             let mut tape = Tape::default();
             let trains: fn(&str) -> bool = if learns { is_world } else { |_| false };
-            // What is judged is what a checkpoint holds.
+            // Validation is of what a checkpoint holds.
             let averaged = !learns && settings.average_decay > 0.0;
             let array = if averaged { Array::Average } else { Array::Values };
             let source = Source { weights, trains, array };
@@ -189,8 +189,8 @@ impl Programs {
             .zip(layouts)
             .map(|(program, (offsets, bytes))| machine.prepare(program.finish(&offsets, bytes, &arena)));
         let mut next = || ready.next().expect("there are as many as were built");
-        let (world, masked, judge) = (next()?, next()?, next()?);
-        Ok(Self { world, masked, judge, behaviour: ready.next().transpose()? })
+        let (world, masked, validation) = (next()?, next()?, next()?);
+        Ok(Self { world, masked, validation, behaviour: ready.next().transpose()? })
     }
 }
 

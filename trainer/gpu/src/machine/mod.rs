@@ -313,10 +313,10 @@ impl Args {
 }
 
 /// The address of a place in a finished program.
-fn address(place: crate::program::Place) -> u64 {
+fn address(place: crate::program::Buffer) -> u64 {
     match place {
-        crate::program::Place::Fixed(address) => address,
-        crate::program::Place::Transient(_) => unreachable!("a finished program has fixed places alone"),
+        crate::program::Buffer::Fixed(address) => address,
+        crate::program::Buffer::Transient(_) => unreachable!("a finished program has fixed places alone"),
     }
 }
 
