@@ -94,6 +94,41 @@ fn a_running_simulator_can_be_joined_and_recorded() {
 }
 
 #[test]
+fn episodes_get_a_second_look_of_the_same_moments_once() {
+    let folder = tempfile::tempdir().unwrap();
+    let (data, domain) = (folder.path().join("data"), Domain::new());
+    let words = ["collect", "--task", "reach", "--pushed", "1", "--masks", "1", "--steps-max", "12"];
+    Running::start(trainer(&domain, &words, &data)).succeed();
+    let path = data.join("reach/pushed-seed0-00000.npz");
+    let clean = Episode::read(&path).unwrap();
+    let with_looks = || {
+        let mut command = trainer(&domain, &words, &data);
+        command.args(["--beside", "textures"]);
+        Running::start(command).succeed();
+        Episode::read(&path).unwrap()
+    };
+    let both = with_looks();
+    let disturbed = both.disturbed.clone().unwrap();
+    let same = disturbed.iter().zip(&both.image).filter(|(a, b)| a == b).count();
+    assert!(same * 2 < both.image.len(), "{same} of {} values look the same", both.image.len());
+    assert_eq!(Episode { disturbed: None, ..both.clone() }, clean, "what was there is untouched");
+    let written = std::fs::metadata(&path).unwrap().modified().unwrap();
+    assert_eq!(with_looks(), both);
+    assert_eq!(std::fs::metadata(&path).unwrap().modified().unwrap(), written, "not collected again");
+
+    // Somebody else's episode under that name has no second look.
+    let other = Episode { reward: &clean.reward + 1.0, ..clean };
+    other.write(&path).unwrap();
+    let mut command = trainer(&domain, &words, &data);
+    command.args(["--beside", "textures"]);
+    let found = command.output().unwrap();
+    let text = String::from_utf8_lossy(&found.stderr).into_owned();
+    assert!(!found.status.success(), "{text}");
+    assert!(text.contains("pushed-seed0-00000") && text.contains("empty folder"), "{text}");
+    assert_eq!(Episode::read(&path).unwrap(), other);
+}
+
+#[test]
 fn ctrl_c_stops_collecting_leaves_whole_episodes_and_no_simulator() {
     let folder = tempfile::tempdir().unwrap();
     let domain = Domain::new();

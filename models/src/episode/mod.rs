@@ -8,6 +8,7 @@
 //! | `is_first`, `is_last`, `is_terminal`, `success` | bool | [T] | |
 //! | `robot_mask` (optional) | u8 | [T, 64, 64, 1] | 1 where the robot is, else 0 |
 //! | `proprio` (optional) | f32 | [T, 18] | joint positions and velocities |
+//! | `disturbed` (optional) | u8 | [T, 64, 64, 3] | the same moments in another look |
 
 mod npz;
 
@@ -47,6 +48,8 @@ pub struct Episode {
     pub robot_mask: Option<Array3<bool>>,
     /// [T, 18].
     pub proprio: Option<Array2<f32>>,
+    /// [T, 64, 64, 3]: what `image` shows, in another look.
+    pub disturbed: Option<Array4<u8>>,
 }
 
 /// Why an episode could not be read, made or written.
@@ -106,6 +109,7 @@ impl Episode {
             pushed: no,
             robot_mask: None,
             proprio: None,
+            disturbed: None,
         }
     }
 
@@ -148,6 +152,7 @@ impl Episode {
             pushed: self.pushed.slice_axis(Axis(0), range).to_owned(),
             robot_mask: self.robot_mask.as_ref().map(|mask| mask.slice_axis(Axis(0), range).to_owned()),
             proprio: self.proprio.as_ref().map(|proprio| proprio.slice_axis(Axis(0), range).to_owned()),
+            disturbed: self.disturbed.as_ref().map(|images| images.slice_axis(Axis(0), range).to_owned()),
         }
     }
 
@@ -158,6 +163,14 @@ impl Episode {
     pub fn read(path: &Path) -> Result<Self, EpisodeError> {
         let bytes = read_capped(path, EPISODE_BYTES_MAX)?;
         npz::read(path, &bytes)
+    }
+
+    /// Whether a `.npz` file has disturbed pictures; the pictures themselves are not read.
+    ///
+    /// # Errors
+    /// See [`EpisodeError`].
+    pub fn is_disturbed(path: &Path) -> Result<bool, EpisodeError> {
+        npz::has(path, npz::DISTURBED)
     }
 
     /// Writes a compressed `.npz` file atomically.
@@ -261,6 +274,7 @@ impl EpisodeBuilder {
                 Array3::from_shape_vec((steps, IMAGE_SIDE, IMAGE_SIDE), this.robot_mask).expect(fits)
             }),
             proprio: Some(Array2::from_shape_vec((steps, PROPRIOCEPTION_LEN), this.proprio).expect(fits)),
+            disturbed: None,
         })
     }
 }

@@ -1,7 +1,7 @@
 //! The archive behind an episode file. Arrays are viewed in the unpacked bytes, so that a header cannot ask for more memory than
 //! the archive holds.
 
-use std::io::{Cursor, Read, Write};
+use std::io::{BufReader, Cursor, Read, Write};
 use std::path::Path;
 
 use ndarray::{Array1, Array4, ArrayD, ArrayViewD, Dimension, Ix1, Ix2, Ix4};
@@ -11,6 +11,17 @@ use zip::{CompressionMethod, ZipArchive, ZipWriter};
 
 use super::{EPISODE_BYTES_MAX, Episode, EpisodeError, STEPS_MAX};
 use crate::{ACTION_LEN, IMAGE_CHANNELS, IMAGE_SIDE, PROPRIOCEPTION_LEN};
+
+/// Key of the pictures in another look.
+pub(super) const DISTURBED: &str = "disturbed";
+
+/// Whether the archive at `path` has an array of this name.
+pub(super) fn has(path: &Path, key: &str) -> Result<bool, EpisodeError> {
+    let broken = |reason: String| EpisodeError::Archive { path: path.to_path_buf(), reason };
+    let file = std::fs::File::open(path).map_err(|error| broken(error.to_string()))?;
+    let archive = ZipArchive::new(BufReader::new(file)).map_err(|error| broken(error.to_string()))?;
+    Ok(archive.index_for_name(&format!("{key}.npy")).is_some())
+}
 
 /// Reads the arrays of one archive.
 struct Reader<'a> {
@@ -103,7 +114,8 @@ pub(super) fn read(path: &Path, bytes: &[u8]) -> Result<Episode, EpisodeError> {
     };
     let archive = ZipArchive::new(Cursor::new(bytes)).map_err(broken)?;
     let mut reader = Reader { path, archive };
-    let image = read_images(&mut reader)?;
+    let bytes = reader.required("image")?;
+    let image = images(&reader, "image", &bytes)?;
     let steps = image.shape()[0];
     let bytes = reader.required("action")?;
     let action = reader.floats("action", &bytes)?;
@@ -135,6 +147,13 @@ pub(super) fn read(path: &Path, bytes: &[u8]) -> Result<Episode, EpisodeError> {
             Some(reader.shaped::<_, Ix2>("proprio", array, &[steps, PROPRIOCEPTION_LEN])?)
         }
     };
+    let disturbed = match reader.unpack(DISTURBED)? {
+        None => None,
+        Some(bytes) => {
+            let array = images(&reader, DISTURBED, &bytes)?.into_dyn();
+            Some(reader.shaped::<_, Ix4>(DISTURBED, array, image.shape())?)
+        }
+    };
     Ok(Episode {
         image,
         action,
@@ -146,22 +165,22 @@ pub(super) fn read(path: &Path, bytes: &[u8]) -> Result<Episode, EpisodeError> {
         pushed,
         robot_mask,
         proprio,
+        disturbed,
     })
 }
 
-fn read_images(reader: &mut Reader<'_>) -> Result<Array4<u8>, EpisodeError> {
-    let bytes = reader.required("image")?;
+fn images(reader: &Reader<'_>, key: &'static str, bytes: &[u8]) -> Result<Array4<u8>, EpisodeError> {
     let expected =
         || format!("uint8 of shape [T, {IMAGE_SIDE}, {IMAGE_SIDE}, {IMAGE_CHANNELS}], T at most {STEPS_MAX}");
-    let view = ArrayViewD::<u8>::view_npy(&bytes)
-        .map_err(|error| reader.wrong("image", format!("unreadable ({error})"), expected()))?;
+    let view = ArrayViewD::<u8>::view_npy(bytes)
+        .map_err(|error| reader.wrong(key, format!("unreadable ({error})"), expected()))?;
     match view.shape() {
         [steps, IMAGE_SIDE, IMAGE_SIDE, IMAGE_CHANNELS] if (1..=STEPS_MAX).contains(steps) => {}
-        shape => return Err(reader.wrong("image", format!("of shape {shape:?}"), expected())),
+        shape => return Err(reader.wrong(key, format!("of shape {shape:?}"), expected())),
     }
     view.to_owned()
         .into_dimensionality::<Ix4>()
-        .map_err(|error| reader.wrong("image", error.to_string(), expected()))
+        .map_err(|error| reader.wrong(key, error.to_string(), expected()))
 }
 
 /// Packs an episode into a compressed archive.
@@ -187,6 +206,9 @@ pub(super) fn to_bytes(episode: &Episode) -> Result<Vec<u8>, String> {
     }
     if let Some(proprio) = &episode.proprio {
         add(&mut zip, "proprio", proprio)?;
+    }
+    if let Some(disturbed) = &episode.disturbed {
+        add(&mut zip, DISTURBED, disturbed)?;
     }
     Ok(zip.finish().map_err(|error| error.to_string())?.into_inner())
 }

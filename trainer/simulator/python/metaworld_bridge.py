@@ -27,6 +27,8 @@ SIMPLIFYING = threading.Lock()
 AIMS_WITH_FINGERS = ("reach",)
 # Numbers that keep apart the random streams of one episode.
 STREAM_LAYOUT, STREAM_LOOK = 0, 1
+# Sets of layouts that never meet, whatever seeds and numbers of episodes are given.
+LAYOUTS = ("learning", "choosing", "reporting")
 
 
 class MissingLibrary(Exception):
@@ -58,6 +60,7 @@ import fast_simplification  # noqa: E402  the renderer must be chosen before MuJ
 import metaworld  # noqa: E402
 import mujoco  # noqa: E402
 from metaworld.policies import ENV_POLICY_MAP  # noqa: E402
+from metaworld_look import Look  # noqa: E402  embedded beside this file
 
 # The experts ask for more than the action range by design; MuJoCo would write its warnings to a file in this folder.
 warnings.filterwarnings("ignore", message="Constant.* may be too high")
@@ -72,16 +75,18 @@ def task_names():
     return sorted(name.removesuffix("-v3") for name in metaworld.ALL_V3_ENVIRONMENTS)
 
 
-def random_stream(seed, episode, stream):
-    return np.random.default_rng([seed, episode, stream])
+def random_stream(layouts, seed, episode, stream):
+    """Every argument has words of its own: numbers of different lengths would run into each other."""
+    words = [word for number in (seed, episode) for word in (number & 0xFFFFFFFF, number >> 32)]
+    return np.random.default_rng([1 + LAYOUTS.index(layouts), stream, *words])
 
 
 class Environment:
     """One task, seen by the moved camera; `step` repeats its action twice."""
 
-    def __init__(self, task, seed, faithful, masks, disturb):
+    def __init__(self, task, layouts, seed, faithful, masks, disturb):
         make = metaworld.ALL_V3_ENVIRONMENTS_GOAL_OBSERVABLE[f"{task}-v3-goal-observable"]
-        self.task, self.seed, self.masks, self.disturb = task, seed, masks, disturb
+        self.task, self.layouts, self.seed, self.masks = task, layouts, seed, masks
         # The class takes 32 bits; layouts are drawn from our own streams.
         self.env = make(seed=seed % 2**32)
         self.env._freeze_rand_vec = False
@@ -100,7 +105,7 @@ class Environment:
         # What tasks write into the model while they reset, so that no episode depends on the one before.
         self.pristine = {name: getattr(self.model, name).copy() for name in ("body_pos", "body_quat", "site_pos")}
         self.camera = Camera(self.model, self.data, faithful)
-        self.look = Look(self.model, self.camera) if disturb == "textures" else None
+        self.look = Look(self.model, self.camera, disturb) if disturb != "none" else None
 
         self.image = self.camera.image
         self.mask = np.zeros((SIZE, SIZE), np.uint8)
@@ -110,9 +115,9 @@ class Environment:
         self.expert_action = np.zeros(4, np.float32)
 
     def reset(self, episode):
-        """Starts an episode; its layout depends on task, seed and `episode` alone."""
-        self.env.np_random = random_stream(self.seed, episode, STREAM_LAYOUT)
-        self.look_random = random_stream(self.seed, episode, STREAM_LOOK)
+        """Starts an episode; its layout depends on task, set of layouts, seed and `episode` alone."""
+        self.env.np_random = random_stream(self.layouts, self.seed, episode, STREAM_LAYOUT)
+        self.look_random = random_stream(self.layouts, self.seed, episode, STREAM_LOOK)
         for name, values in self.pristine.items():
             getattr(self.model, name)[:] = values
         mujoco.mj_resetData(self.model, self.data)
@@ -152,10 +157,11 @@ class Environment:
         self.facts[2:11] = (positions - self.position_middle) / self.position_half_range
         self.facts[11:] = velocities
         self.camera.shoot()
-        if self.masks or self.disturb == "noise":
+        noisy = self.look is not None and self.look.noise
+        if self.masks or noisy:
             is_robot, is_background = self.camera.segment()
             np.multiply(is_robot, 255, out=self.mask, dtype=np.uint8, casting="unsafe")
-            if self.disturb == "noise":
+            if noisy:
                 noise = self.look_random.integers(0, 256, self.image.shape, np.uint8)
                 np.copyto(self.image, noise, where=is_background[..., None])
 
@@ -224,6 +230,15 @@ class Camera:
                 robot[thing.segid + 1] = body > 0 and self.robot_bodies[body]
                 background[thing.segid + 1] = body == 0
         return robot[colour], background[colour]
+
+    def upload(self, texture):
+        """Sends a texture of `drawn` to the graphics library."""
+        self.make_current()
+        mujoco.mjr_uploadTexture(self.drawn, self.context, texture)
+
+    def place(self):
+        """Takes over where the model's camera and lights are now."""
+        mujoco.mj_camlight(self.model, self.data)
 
     def _body_of(self, thing):
         """The body that carries a drawn geom or site, or -1."""
@@ -297,45 +312,3 @@ def vertex_normals(points, corners):
         np.add.at(normals, corners[:, i], face_normals)
     return normals / np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-12)
 
-
-class Look:
-    """Changes colours and textures of everything but the robot."""
-
-    def __init__(self, model, camera):
-        self.model, self.camera = model, camera
-        is_robot = camera.robot_bodies[model.geom_bodyid]
-        of_robot = set(model.geom_matid[is_robot])
-        self.materials = [i for i in range(model.nmat) if i not in of_robot]
-        self.geoms = np.flatnonzero(~is_robot & (model.geom_matid < 0))
-        drawn = camera.drawn
-        self.textures = [i for i in range(drawn.ntex) if drawn.tex_nchannel[i] == 3]
-
-    def change(self, random):
-        """Draws a new look; the same random stream gives the same look."""
-        self.model.mat_rgba[self.materials, :3] = random.uniform(0.1, 1, (len(self.materials), 3))
-        self.model.geom_rgba[self.geoms, :3] = random.uniform(0.1, 1, (len(self.geoms), 3))
-        drawn = self.camera.drawn
-        self.camera.make_current()
-        for texture in self.textures:
-            height, width = drawn.tex_height[texture], drawn.tex_width[texture]
-            start = drawn.tex_adr[texture]
-            pattern = random_pattern(random, height, width)
-            drawn.tex_data[start : start + pattern.size] = pattern.ravel()
-            mujoco.mjr_uploadTexture(drawn, self.camera.context, texture)
-
-
-def random_pattern(random, height, width):
-    """Two colours in blocks, stripes or blotches. [height, width, 3] u8."""
-    columns_of_cells = int(random.integers(4, 17))
-    row, column = np.arange(height) * columns_of_cells // width, np.arange(width) * columns_of_cells // width
-    cells = np.indices((row[-1] + 1, columns_of_cells))
-    kind = random.choice(["checks", "stripes", "blotches"])
-    if kind == "checks":
-        share = cells.sum(0) % 2
-    elif kind == "stripes":
-        share = cells[random.integers(2)] % 2
-    else:
-        share = random.random(cells.shape[1:])
-    one, other = random.integers(0, 256, (2, 3))
-    colours = (share[..., None] * one + (1 - share[..., None]) * other).astype(np.uint8)
-    return colours[row[:, None], column]

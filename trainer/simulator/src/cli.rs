@@ -4,7 +4,7 @@ use std::path::PathBuf;
 use std::time::Duration;
 
 use clap::{Args, Parser, Subcommand, ValueEnum};
-use rcwm_simulator::environment::{Disturbance, EnvironmentSettings, STEPS_MAX};
+use rcwm_simulator::environment::{Disturbance, EnvironmentSettings, Layouts, STEPS_MAX};
 use rcwm_simulator::policy::Policy;
 use rcwm_simulator::serve::{Pace, ServeSettings};
 
@@ -62,7 +62,10 @@ pub struct ServeArguments {
     /// Name of the shared-memory link; a controller connects to the same.
     #[arg(long, default_value = "rcwm")]
     pub instance: String,
-    /// Layouts, scripted decisions and disturbances depend on this and the episode's number.
+    /// Which set of layouts; no two sets share one, whatever the seeds.
+    #[arg(long, value_enum, default_value_t = Layouts::Learning)]
+    pub layouts: Layouts,
+    /// Layouts, scripted decisions and disturbances of a set depend on this and the episode's number.
     #[arg(long, default_value_t = 0)]
     pub seed: u64,
     /// How many episodes; 0: until stopped.
@@ -90,7 +93,7 @@ pub struct ServeArguments {
     /// Render the robot's mask as well.
     #[arg(long)]
     pub masks: bool,
-    /// Visual disturbance.
+    /// Visual disturbance, drawn anew for each episode (`paper` is fixed).
     #[arg(long, value_enum, default_value_t = Disturbance::None)]
     pub disturb: Disturbance,
     /// Meta-World's own picture with shadows, reflections and full meshes; several times slower.
@@ -143,6 +146,7 @@ impl ServeArguments {
     pub fn environment(&self) -> EnvironmentSettings {
         EnvironmentSettings {
             task: self.task.clone(),
+            layouts: self.layouts,
             seed: self.seed,
             faithful: self.faithful,
             masks: self.masks,

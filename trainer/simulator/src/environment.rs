@@ -19,17 +19,40 @@ pub const STEPS_MAX: u32 = 250;
 /// Reward and success come before the proprioception.
 const FACTS_LEN: usize = 2 + PROPRIOCEPTION_LEN;
 
-/// A visual disturbance; the robot's own look and the physics never change.
+/// A visual disturbance, by strength; the robot's own look and the physics never change.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default, ValueEnum, Serialize)]
 #[serde(rename_all = "lowercase")]
 pub enum Disturbance {
     /// Meta-World's own look.
     #[default]
     None,
-    /// Colours and textures of objects, table and background are drawn anew for each episode.
+    /// The paper's (Fig. 8): table, rim and floor are of darker wood, navy and mint.
+    Paper,
+    /// Table, rim and floor have random colours or patterns.
+    Surfaces,
+    /// Brightness, colour and direction of the light.
+    Light,
+    /// The camera is moved by up to 2 cm and turned by up to 2 degrees.
+    Camera,
+    /// Colours and textures of everything but the robot, objects and sky included.
     Textures,
     /// Sky and floor are replaced by random pixels in each picture.
     Noise,
+    /// For learning: some of the above but `paper`, together.
+    Varied,
+}
+
+/// A set of layouts. No two of them share one, whatever seeds and numbers of episodes are given.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Default, ValueEnum, Serialize)]
+#[serde(rename_all = "lowercase")]
+pub enum Layouts {
+    /// To learn from.
+    #[default]
+    Learning,
+    /// To choose settings, checkpoints and recipes on.
+    Choosing,
+    /// To report on, never to choose or learn on.
+    Reporting,
 }
 
 /// What to simulate and how to show it.
@@ -37,7 +60,9 @@ pub enum Disturbance {
 pub struct EnvironmentSettings {
     /// Name of the task.
     pub task: String,
-    /// Layouts and disturbances depend on this and the episode's number alone.
+    /// Which layouts.
+    pub layouts: Layouts,
+    /// Layouts and disturbances of a set depend on this and the episode's number alone.
     pub seed: u64,
     /// Meta-World's own picture (shadows, reflections, full meshes) instead of the fast one.
     pub faithful: bool,
@@ -71,9 +96,10 @@ impl Environment {
         let module = bridge()?;
         Python::attach(|py| {
             let failed = |error: PyErr| python_error(py, "building the task", &error);
-            let EnvironmentSettings { task, seed, faithful, masks, disturb } = &settings;
+            let EnvironmentSettings { task, layouts, seed, faithful, masks, disturb } = &settings;
             let disturb = disturb.to_possible_value().expect("no variant is hidden");
-            let arguments = (task, *seed, *faithful, *masks, disturb.get_name());
+            let layouts = layouts.to_possible_value().expect("no variant is hidden");
+            let arguments = (task, layouts.get_name(), *seed, *faithful, *masks, disturb.get_name());
             let object = module.bind(py).call_method1("Environment", arguments).map_err(failed)?;
             let image = array(&object, "image").map_err(failed)?;
             let mask = array(&object, "mask").map_err(failed)?;

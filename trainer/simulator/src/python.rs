@@ -19,7 +19,11 @@ const BUILT_FOR: &str = env!("RCWM_PYTHON_VERSION");
 const BUILT_WITH: &str = env!("RCWM_PYTHON_EXECUTABLE");
 const VENV_VARIABLE: &str = "RCWM_PYTHON_VENV";
 
-const BRIDGE: &str = include_str!("../python/metaworld_bridge.py");
+/// The embedded modules, each before those that import it; the last one is the bridge.
+const MODULES: [(&CStr, &CStr, &str); 2] = [
+    (c"metaworld_look", c"metaworld_look.py", include_str!("../python/metaworld_look.py")),
+    (c"metaworld_bridge", c"metaworld_bridge.py", include_str!("../python/metaworld_bridge.py")),
+];
 
 /// The virtual environment whose packages are used: `RCWM_PYTHON_VENV`, or that of the build.
 fn venv() -> PathBuf {
@@ -42,10 +46,11 @@ pub fn bridge() -> Result<Py<PyModule>, SimulatorError> {
     start(&venv)?;
     Python::attach(|py| {
         if module.is_none() {
-            let code = CString::new(BRIDGE).expect("the embedded module holds no zero byte");
-            let made = PyModule::from_code(py, &code, c"metaworld_bridge.py", c"metaworld_bridge")
-                .map_err(|error| import_error(py, &error, &venv))?;
-            *module = Some(made.unbind());
+            for (name, file, source) in MODULES {
+                let code = CString::new(source).expect("the embedded module holds no zero byte");
+                let made = PyModule::from_code(py, &code, file, name);
+                *module = Some(made.map_err(|error| import_error(py, &error, &venv))?.unbind());
+            }
         }
         Ok(module.as_ref().expect("set above").clone_ref(py))
     })

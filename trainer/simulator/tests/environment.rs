@@ -6,13 +6,20 @@ use rcwm_models::wire::Observation;
 use rcwm_models::{ACTION_LEN, IMAGE_SIDE};
 use rcwm_simulator::SimulatorError;
 use rcwm_simulator::environment::{
-    Disturbance, Environment, EnvironmentSettings, STEPS_MAX, installed_tasks,
+    Disturbance, Environment, EnvironmentSettings, Layouts, STEPS_MAX, installed_tasks,
 };
 use rcwm_simulator::policy::{Policy, Script};
 
 fn settings(task: &str) -> EnvironmentSettings {
     let task = task.to_owned();
-    EnvironmentSettings { task, seed: 3, faithful: false, masks: true, disturb: Disturbance::None }
+    EnvironmentSettings {
+        task,
+        layouts: Layouts::Learning,
+        seed: 3,
+        faithful: false,
+        masks: true,
+        disturb: Disturbance::None,
+    }
 }
 
 fn see(environment: &Environment) -> (Observation, bool) {
@@ -202,25 +209,87 @@ fn an_episode_has_no_step_beyond_its_last() {
     assert!(matches!(environment.step([0.0; ACTION_LEN]), Err(SimulatorError::Python { .. })));
 }
 
+fn disturbed(disturb: Disturbance) -> Environment {
+    Environment::open(EnvironmentSettings { disturb, ..settings("coffee-pull") }).unwrap()
+}
+
+/// Shares of the robot's pixels and of the others that are the same in both.
+fn unchanged(a: &Observation, b: &Observation) -> (f64, f64) {
+    let pixels = || a.image.chunks(3).zip(b.image.chunks(3)).zip(&a.robot_mask);
+    let of = |value: u8| share(pixels().filter(|(_, mask)| **mask == value).map(|((a, b), _)| a == b));
+    (of(255), of(0))
+}
+
 #[test]
 fn disturbances_change_the_picture_but_neither_robot_nor_physics() {
-    let plain = Environment::open(settings("coffee-pull")).unwrap();
-    let plain = watch(&plain, 1, 3);
-    for disturb in [Disturbance::Textures, Disturbance::Noise] {
-        let environment =
-            Environment::open(EnvironmentSettings { disturb, ..settings("coffee-pull") }).unwrap();
-        let disturbed = watch(&environment, 1, 3);
-        assert_same(&watch(&environment, 1, 3), &disturbed);
-        for (a, b) in plain.iter().zip(&disturbed) {
+    let plain = watch(&disturbed(Disturbance::None), 1, 3);
+    for disturb in [Disturbance::Paper, Disturbance::Surfaces, Disturbance::Textures, Disturbance::Noise] {
+        let environment = disturbed(disturb);
+        let seen = watch(&environment, 1, 3);
+        watch(&environment, 2, 1);
+        assert_same(&watch(&environment, 1, 3), &seen);
+        for (a, b) in plain.iter().zip(&seen) {
             assert_eq!(numbers(a), numbers(b));
             assert!(a.robot_mask == b.robot_mask);
-            let pixels = || a.image.chunks(3).zip(b.image.chunks(3)).zip(&a.robot_mask);
-            let robot = share(pixels().filter(|(_, mask)| **mask == 255).map(|((a, b), _)| a == b));
-            let rest = share(pixels().filter(|(_, mask)| **mask == 0).map(|((a, b), _)| a == b));
+            let (robot, rest) = unchanged(a, b);
             assert!(
                 robot > 0.97 && rest < 0.9,
                 "{disturb:?}: unchanged {robot} of the robot, {rest} of the rest"
             );
+        }
+    }
+}
+
+#[test]
+fn the_papers_look_is_always_the_same_and_leaves_the_sky() {
+    let environment = disturbed(Disturbance::Paper);
+    let plain = disturbed(Disturbance::None);
+    for episode in 0..2 {
+        let (a, b) = (watch(&plain, episode, 1)[0], watch(&environment, episode, 1)[0]);
+        let pixel = |seen: &Observation, x: usize, y: usize| -> [u8; 3] {
+            seen.image[3 * (y * IMAGE_SIDE + x)..][..3].try_into().unwrap()
+        };
+        assert_eq!(pixel(&a, 2, 2), pixel(&b, 2, 2), "the sky");
+        let ([red, green, blue], [light, ..]) = (pixel(&b, 12, 58), pixel(&a, 12, 58));
+        assert!(red > green && green > blue && red < light, "darker wood: {red} {green} {blue}, was {light}");
+    }
+}
+
+#[test]
+fn another_light_leaves_masks_and_physics_and_another_camera_the_physics() {
+    let plain = watch(&disturbed(Disturbance::None), 1, 3);
+    let light = watch(&disturbed(Disturbance::Light), 1, 3);
+    let camera = watch(&disturbed(Disturbance::Camera), 1, 3);
+    for ((a, light), camera) in plain.iter().zip(&light).zip(&camera) {
+        assert_eq!(numbers(a), numbers(light));
+        assert_eq!(numbers(a), numbers(camera));
+        assert!(a.robot_mask == light.robot_mask);
+        assert!(unchanged(a, light).0 < 0.5, "the robot is lit, too");
+        let moved = share(a.robot_mask.iter().zip(&camera.robot_mask).map(|(a, b)| a != b));
+        assert!((0.001..0.1).contains(&moved), "{moved} of the mask moved");
+    }
+}
+
+#[test]
+fn no_two_sets_of_layouts_share_one_whatever_the_seeds() {
+    // Seeds and numbers whose 32-bit words are each other's.
+    let seeds = [(0, 1), (1, 0), (1 << 32, 0), (0, 1 << 32), (2, 3 << 32), (3, 2)];
+    let mut seen: Vec<(String, Vec<u8>)> = Vec::new();
+    for layouts in [Layouts::Learning, Layouts::Choosing, Layouts::Reporting] {
+        for (seed, episode) in seeds {
+            let environment = Environment::open(EnvironmentSettings {
+                layouts,
+                seed,
+                masks: false,
+                ..settings("button-press")
+            })
+            .unwrap();
+            environment.reset(episode).unwrap();
+            let picture = see(&environment).0.image.to_vec();
+            let name = format!("{layouts:?} {seed} {episode}");
+            let same = seen.iter().find(|(_, other)| *other == picture);
+            assert!(same.is_none(), "{name} is {:?}", same.map(|(name, _)| name));
+            seen.push((name, picture));
         }
     }
 }

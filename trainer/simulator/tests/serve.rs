@@ -9,7 +9,7 @@ use rcwm_models::ACTION_LEN;
 use rcwm_models::wire::{
     Action, ActionSource, ControllerLink, LinkSettings, Observation, ObservationFlags, SimulatorLink, Wait,
 };
-use rcwm_simulator::environment::{Disturbance, Environment, EnvironmentSettings};
+use rcwm_simulator::environment::{Disturbance, Environment, EnvironmentSettings, Layouts};
 use rcwm_simulator::policy::Policy;
 use rcwm_simulator::report::Tally;
 use rcwm_simulator::serve::{Pace, ServeSettings, serve};
@@ -44,6 +44,7 @@ fn run<T: Send + 'static>(
     let link = SimulatorLink::open(link_settings(&settings.instance)).unwrap();
     let environment = Environment::open(EnvironmentSettings {
         task: "reach".to_owned(),
+        layouts: Layouts::Learning,
         seed: 1,
         faithful: false,
         masks: false,

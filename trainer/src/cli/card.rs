@@ -112,9 +112,9 @@ impl Card {
         card += "Success counts where the task was solved at any step of the episode. Check and score it; BUNDLE is this folder:\n\n```sh\n\
                  rcwm-runtime verify --bundle BUNDLE\n";
         for ClosedLoopReport { settings, episodes, .. } in &results.tasks {
-            let ClosedLoopSettings { task, seed, disturb, .. } = settings;
+            let ClosedLoopSettings { task, layouts, seed, disturb, .. } = settings;
             card += &format!(
-                "rcwm-trainer evaluate --bundle BUNDLE --task {task} --episodes {episodes} --seed {seed} --disturb {disturb}\n"
+                "rcwm-trainer evaluate --bundle BUNDLE --task {task} --episodes {episodes} --layouts {layouts} --seed {seed} --disturb {disturb}\n"
             );
         }
         card += "```\n";
@@ -130,11 +130,11 @@ fn processor_time(checkpoint: &CheckpointSettings) -> String {
 }
 
 fn row(scored: &ClosedLoopReport) -> String {
-    let ClosedLoopSettings { task, seed, disturb, .. } = &scored.settings;
+    let ClosedLoopSettings { task, layouts, seed, disturb, .. } = &scored.settings;
     let disturbed = if disturb == "none" { String::new() } else { format!(", {disturb} disturbed") };
     let percent = |x: f64| format!("{:.0}%", 100.0 * x);
     format!(
-        "| success, {task}{disturbed} | **{}** ({} of {}; 95% {} to {}), return {:.0} +- {:.0}, seed {seed} |\n",
+        "| success, {task}{disturbed} | **{}** ({} of {}; 95% {} to {}), return {:.0} +- {:.0}, layouts for {layouts}, seed {seed} |\n",
         percent(scored.success_rate),
         scored.successes,
         scored.episodes,

@@ -5,7 +5,9 @@ use std::time::{Duration, Instant};
 use anyhow::{Context, Result, ensure};
 use indicatif::{ProgressBar, ProgressStyle};
 use rcwm_models::tasks::{DOWNSTREAM, UPSTREAM, task_id};
-use rcwm_trainer::simulators::{Amounts, CollectSettings, Collected, Plan, Seen, Sums, collect, record};
+use rcwm_trainer::simulators::{
+    Amounts, CollectSettings, Collected, DISTURBANCES, Plan, Seen, Sums, collect, collect_disturbed, record,
+};
 use serde::Serialize;
 
 /// Record episodes of Meta-World, as Dreamer's .npz files in one folder a task
@@ -13,6 +15,7 @@ use serde::Serialize;
 #[command(after_help = "Examples:
   rcwm-trainer collect --task upstream --expert 50 --mixed 28 --random 8 --masks 4 --out data
   rcwm-trainer collect --task hammer --expert 50 --out data/hammer
+  rcwm-trainer collect --task hammer --pushed 70 --beside varied --out data/hammer-looks
   rcwm-trainer collect --join arm1 --episodes 10 --out data/arm1
 
 The simulators are started and stopped here; --join records one that runs already. Episodes that
@@ -50,10 +53,14 @@ pub struct Collect {
     #[arg(long, default_value_t = 250, value_name = "N", value_parser = clap::value_parser!(u32).range(1..=250))]
     steps_max: u32,
     /// Visual disturbance
-    #[arg(long, default_value = "none", value_parser = ["none", "textures", "noise"])]
+    #[arg(long, default_value = "none", value_parser = DISTURBANCES)]
     disturb: String,
+    /// Add to every episode what it looks like with this disturbance: the script does the same once more. What is learned
+    /// from can be seen so (replay.look), and drawn as it is
+    #[arg(long, value_name = "DISTURBANCE", value_parser = DISTURBANCES)]
+    beside: Option<String>,
     /// Record a simulator that runs already; it gets random actions where it waits for a policy
-    #[arg(long, value_name = "INSTANCE", conflicts_with_all = ["tasks", "expert", "mixed", "pushed", "random", "masks"])]
+    #[arg(long, value_name = "INSTANCE", conflicts_with_all = ["tasks", "expert", "mixed", "pushed", "random", "masks", "beside"])]
     join: Option<String>,
     /// Episodes to record with --join
     #[arg(long, default_value_t = 1, value_name = "N", requires = "join")]
@@ -113,6 +120,15 @@ impl Collect {
         let sums = collect(&plan, &settings, stop, &|seen| advance(&bar, seen))
             .context("collecting stopped; whole episodes are kept and the same command goes on")?;
         bar.finish_and_clear();
+        if let Some(look) = self.beside.as_ref().filter(|_| !stop.load(std::sync::atomic::Ordering::Relaxed))
+        {
+            let plan = Plan::of_disturbed(&self.out, &tasks, &amounts, self.seed, EPISODES_A_RUN)?;
+            let settings = CollectSettings { disturb: look.clone(), ..settings };
+            let bar = self::bar(plan.episodes(), self.steps_max)?;
+            collect_disturbed(&plan, &settings, stop, &|seen| advance(&bar, seen))
+                .context("collecting stopped; whole episodes are kept and the same command goes on")?;
+            bar.finish_and_clear();
+        }
         Ok((sums, plan.present))
     }
 

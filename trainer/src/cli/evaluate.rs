@@ -20,6 +20,7 @@ use rcwm_trainer::model::agent::Agent;
 use rcwm_trainer::plots;
 use rcwm_trainer::replay::Folder;
 use rcwm_trainer::report::shown_path;
+use rcwm_trainer::simulators::{DISTURBANCES, LAYOUTS};
 
 use super::report::{Inputs, ReportArguments};
 
@@ -85,7 +86,7 @@ pub struct Evaluate {
     #[arg(long, default_value_t = 250, value_name = "N", value_parser = clap::value_parser!(u32).range(1..=250))]
     steps_max: u32,
     /// Visual disturbance (repeatable; a report always has none too)
-    #[arg(long, default_value = "none", value_parser = ["none", "textures", "noise"])]
+    #[arg(long, default_value = "none", value_parser = DISTURBANCES)]
     disturb: Vec<String>,
     /// The runtime's engine, or the trainer itself in a runtime's place
     #[arg(long, default_value = "tract", value_parser = ["tract", "ort", TRAINER_ENGINE])]
@@ -102,6 +103,9 @@ pub struct Evaluate {
     /// Trajectories, draws and layouts depend on this
     #[arg(long, default_value_t = 0)]
     seed: u64,
+    /// Which layouts to score on. No two sets share one; settings are chosen on `choosing`, what is told is from `reporting`
+    #[arg(long, default_value = "reporting", value_parser = LAYOUTS)]
+    layouts: String,
     /// Where to compute with --data: cpu, cuda or cuda:N
     #[arg(long, default_value = "cpu")]
     device: String,
@@ -300,7 +304,10 @@ impl Evaluate {
             let settings = self.loop_settings(task, disturb);
             let report = match &policy {
                 Deployed::Bundle(bundle) => closed_loop(bundle, &settings, stop, show),
-                Deployed::Here(checkpoint) => closed_loop_in_trainer(checkpoint, &settings, stop, show),
+                Deployed::Here(checkpoint) => {
+                    let agent = Agent::new(&checkpoint.parameters.frozen(), &checkpoint.settings.model)?;
+                    closed_loop_in_trainer(agent, &settings, stop, show)
+                }
             };
             bar.finish_and_clear();
             let report = report?;
@@ -316,6 +323,7 @@ impl Evaluate {
         ClosedLoopSettings {
             task: task.to_owned(),
             episodes: self.episodes,
+            layouts: self.layouts.clone(),
             seed: self.seed,
             steps_max: self.steps_max,
             disturb: disturb.to_owned(),

@@ -13,6 +13,9 @@ use rcwm_trainer::training::{
 
 use super::bars::{self, absolute};
 
+/// The paper's 1e-4 and 5e-5.
+const ENVIRONMENT_OVER_ROBOT_RATE: f64 = 2.0;
+
 /// Learn a task from demonstrations alone: environment's side, whole world model, then the actor
 #[derive(Debug, clap::Args)]
 #[command(after_help = "Examples:
@@ -20,7 +23,7 @@ use super::bars::{self, absolute};
       button-press --out runs/button-press
   rcwm-trainer fewshot --from runs/small/checkpoints/last --data data/hammer --out runs/hammer \\
       --reset all-but-robot --set fewshot.environment_updates=600 --set \\
-      fewshot.demonstrations=20
+      fewshot.demonstrations=20 --separate-rates
   rcwm-trainer fewshot --out runs/button-press --resume
 
 Only successful episodes are used. Every setting and its value is in settings.toml of the run's
@@ -45,6 +48,9 @@ pub struct Fewshot {
     /// What of the model is drawn anew; the vanilla baseline keeps everything
     #[arg(long, value_enum, default_value = "none", conflicts_with = "resume")]
     reset: Reset,
+    /// Learn the robot's side at half the rate of the environment's: with --reset all-but-robot the paper's transfer
+    #[arg(long, conflicts_with = "resume")]
+    separate_rates: bool,
     /// Change one setting, for example --set fewshot.actor_updates=2000 (repeatable)
     #[arg(long = "set", value_name = "KEY=VALUE")]
     overrides: Vec<String>,
@@ -105,6 +111,11 @@ impl Fewshot {
                 let mut settings = bars::settings_from(source, Phase::Fewshot, self.preset);
                 settings.from = absolute(self.from.as_deref().unwrap_or(&self.out))?;
                 settings.reset.parts = self.reset;
+                if self.separate_rates {
+                    let world = &mut settings.world;
+                    world.environment_learning_rate = world.adam.learning_rate;
+                    world.adam.learning_rate /= ENVIRONMENT_OVER_ROBOT_RATE;
+                }
                 settings
             }
         };

@@ -11,7 +11,8 @@ use rcwm_models::settings::{self, SettingsError};
 use rcwm_models::tasks::task_id;
 use rcwm_trainer::checkpoint::Checkpoint;
 use rcwm_trainer::training::{
-    Finetuning, Line, OnlineOutcome, OnlineProgress, Phase, Run, TrainingError, TrainingSettings,
+    EvaluationFacts, Finetuning, Line, OnlineOutcome, OnlineProgress, Phase, Run, TrainingError,
+    TrainingSettings,
 };
 
 use super::bars::{self, absolute};
@@ -182,6 +183,12 @@ impl Bars {
         }
         if let Some(line) = progress.line {
             self.bar.set_message(describe(line, progress.success_rate));
+        }
+        if let Some(line) = progress.evaluation {
+            let EvaluationFacts { policy_steps, episodes, successes, layouts, .. } = &line.evaluation;
+            self.bar.println(format!(
+                "after {policy_steps} steps: {successes} of {episodes} solved, layouts for {layouts}"
+            ));
         }
         if let Some(line) = progress.episode {
             let facts = &line.episode;

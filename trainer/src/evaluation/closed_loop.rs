@@ -12,7 +12,7 @@ use serde::{Deserialize, Serialize};
 use super::statistics::{Interval, mean_and_std, wilson};
 use crate::acting::FleetError;
 use crate::model::parameters::ParameterError;
-use crate::simulators::{ProcessError, Program, RunningProgram};
+use crate::simulators::{LEARNING, ProcessError, Program, RunningProgram};
 
 /// A simulator or runtime whose other side is gone ends by itself after so many seconds.
 const SILENCE_S: &str = "120";
@@ -108,11 +108,14 @@ pub struct ClosedLoopSettings {
     pub task: String,
     /// Episodes in all.
     pub episodes: u64,
-    /// Layouts depend on this and on an episode's number only, so that every policy meets the same ones.
+    /// The set of layouts: one of [`LAYOUTS`](crate::simulators::LAYOUTS). Results of before there were sets began where learning does.
+    #[serde(default = "learning")]
+    pub layouts: String,
+    /// Layouts of the set depend on this and on an episode's number only, so that every policy meets the same ones.
     pub seed: u64,
     /// Decisions in an episode.
     pub steps_max: u32,
-    /// Visual disturbance: `none`, `textures` or `noise`.
+    /// Visual disturbance: one of [`DISTURBANCES`](crate::simulators::DISTURBANCES).
     pub disturb: String,
     /// The runtime's engine: `tract` or `ort`; `trainer` where no runtime took part.
     pub engine: String,
@@ -124,6 +127,10 @@ pub struct ClosedLoopSettings {
     pub simulator: Option<PathBuf>,
     /// The runtime's path, where it is not beside this program.
     pub runtime: Option<PathBuf>,
+}
+
+fn learning() -> String {
+    LEARNING.to_owned()
 }
 
 /// How well a policy solves a task.
@@ -369,7 +376,7 @@ impl Pair {
             .env("RCWM_PREFIX", &domain.prefix)
             .args(["serve", "--pace", "lockstep", "--policy", "remote", "--wait-controller", SILENCE_S])
             .args(["--task", &settings.task, "--instance", &instance, "--disturb", &settings.disturb])
-            .args(["--seed", &settings.seed.to_string()])
+            .args(["--layouts", &settings.layouts, "--seed", &settings.seed.to_string()])
             .args(["--first-episode", &first_episode.to_string()])
             .args(["--episodes", &episodes.to_string()])
             .args(["--steps-max", &settings.steps_max.to_string(), "--json"])
@@ -429,6 +436,7 @@ mod tests {
         ClosedLoopSettings {
             task: "reach".into(),
             episodes: 4,
+            layouts: LEARNING.into(),
             seed: 0,
             steps_max: 5,
             disturb: "none".into(),

@@ -6,7 +6,6 @@ use rcwm_models::episode::Episode;
 
 use super::closed_loop::{ClosedLoopError, ClosedLoopReport, ClosedLoopSettings, Position, Served};
 use crate::acting::{Fleet, Policy};
-use crate::checkpoint::Checkpoint;
 use crate::model::agent::Agent;
 use crate::model::latent::Sampler;
 use crate::simulators::Launch;
@@ -14,13 +13,13 @@ use crate::simulators::Launch;
 /// What a report of [`closed_loop_in_trainer`] gives as its engine.
 pub const TRAINER_ENGINE: &str = "trainer";
 
-/// Runs a checkpoint's policy in simulators and counts its successes, deciding in this process: for models that no runtime deploys, such as
-/// the vanilla baseline. Layouts, episodes and what counts as success are those of [`super::closed_loop`].
+/// Runs a policy in simulators and counts its successes, deciding in this process: for models that no runtime deploys, such as the vanilla
+/// baseline, and while a policy learns. The agent's parameters must be frozen. Layouts, episodes and what counts as success are those of [`super::closed_loop`].
 ///
 /// # Errors
 /// See [`ClosedLoopError`]; every process has ended then.
 pub fn closed_loop_in_trainer(
-    checkpoint: &Checkpoint,
+    agent: Agent,
     settings: &ClosedLoopSettings,
     stop: &AtomicBool,
     mut seen: impl FnMut(&[Position]),
@@ -30,7 +29,6 @@ pub fn closed_loop_in_trainer(
     let launches: Vec<_> =
         shares.iter().enumerate().map(|(index, share)| launch(settings, index, share)).collect();
     let mut fleet = Fleet::new(&launches, &[])?;
-    let agent = Agent::new(&checkpoint.parameters.frozen(), &checkpoint.settings.model)?;
     let mut policy = Policy::new(agent, fleet.len(), &Device::Cpu);
     let mut sampler = if settings.sample { Sampler::seeded(settings.seed) } else { Sampler::Mode };
     let mut served: Vec<_> = shares.iter().map(|_| Served::default()).collect();
@@ -70,6 +68,7 @@ pub fn closed_loop_in_trainer(
 fn launch(settings: &ClosedLoopSettings, index: usize, share: &std::ops::Range<u64>) -> Launch {
     let instance = format!("evaluate-{}-{index}", std::process::id());
     Launch {
+        layouts: settings.layouts.clone(),
         first_episode: share.start,
         episodes: share.end - share.start,
         steps_max: settings.steps_max,

@@ -10,6 +10,8 @@ use crate::model::latent::FirstSteps;
 pub struct Batch {
     /// u8 [B, T, 64, 64, 3].
     pub image: Tensor,
+    /// What the encoders see in place of `image`, which the decoder is to draw all the same; of the same shape.
+    pub seen: Option<Tensor>,
     /// The action that led to the image: [B, T, action].
     pub action: Tensor,
     /// [B, T].
@@ -35,6 +37,7 @@ impl Batch {
         let part = |x: &Tensor| x.narrow(0, rows.start, rows.len());
         Ok(Self {
             image: part(&self.image)?,
+            seen: self.seen.as_ref().map(part).transpose()?,
             action: part(&self.action)?,
             reward: part(&self.reward)?,
             terminal: part(&self.terminal)?,
@@ -55,6 +58,8 @@ pub struct HostBatch {
     pub length: usize,
     /// B * T images; empty where `place` tells them.
     pub image: Vec<u8>,
+    /// B * T images that the encoders see; empty where these are the images.
+    pub seen: Vec<u8>,
     /// B * T places of images in a store; empty where the images are here.
     pub place: Vec<u32>,
     /// Whether masks are used.
@@ -84,8 +89,11 @@ impl HostBatch {
         let (b, t) = (self.rows, self.length);
         let terminal: Vec<f32> = self.terminal.iter().map(|flag| f32::from(u8::from(*flag))).collect();
         let mask = |mask| Tensor::from_vec(mask, (b, t, IMAGE_SIDE, IMAGE_SIDE, 1), device);
+        let images =
+            |images| Tensor::from_vec(images, (b, t, IMAGE_SIDE, IMAGE_SIDE, IMAGE_CHANNELS), device);
         Ok(Batch {
-            image: Tensor::from_vec(self.image, (b, t, IMAGE_SIDE, IMAGE_SIDE, IMAGE_CHANNELS), device)?,
+            image: images(self.image)?,
+            seen: if self.seen.is_empty() { None } else { Some(images(self.seen)?) },
             action: Tensor::from_vec(self.action, (b, t, ACTION_LEN), device)?,
             reward: Tensor::from_vec(self.reward, (b, t), device)?,
             terminal: Tensor::from_vec(terminal, (b, t), device)?,

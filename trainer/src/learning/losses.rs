@@ -64,7 +64,7 @@ pub fn world_losses(
     settings: &WorldSettings,
     sampler: &mut Sampler,
 ) -> Result<WorldLosses> {
-    let embeds = part("encode", || agent.world.encode(&batch.image))?;
+    let embeds = part("encode", || agent.world.encode(batch.seen.as_ref().unwrap_or(&batch.image)))?;
     let observed = part("observe", || agent.world.observe(&embeds, &batch.action, &batch.first, sampler))?;
     let painted = part("decode", || painted(agent, batch, settings.paint_every, &observed.posteriors))?;
     part("other losses", || other_losses(agent, batch, settings, observed, painted))

@@ -5,6 +5,7 @@
 //! | `settings` | everything that can be chosen, with the paper's values |
 //! | `batch` | sequences of experience as tensors |
 //! | `losses` | image, mask, reward, continuation, KL per branch (spec: losses; eq. 2, 3, 9) |
+//! | `look` | how the encoders see what is learned from: disturbed, with other colours |
 //! | `kl` | balanced KL with free bits, per branch |
 //! | `gradients`, `adam` | gradients by name, clipping, the optimiser |
 //! | `parts` | where the time of an update goes |
@@ -16,6 +17,7 @@ mod adam;
 mod batch;
 mod gradients;
 mod kl;
+mod look;
 mod losses;
 pub mod parts;
 mod settings;
@@ -27,6 +29,7 @@ pub use adam::{Adam, AdamSettings, Moments};
 pub use batch::{Batch, HostBatch};
 pub use gradients::Gradients;
 pub use kl::{BranchKl, balanced_kl};
+pub use look::{Jitter, Look, LookSettings};
 pub use losses::{LossValues, WorldLosses, world_losses};
 pub use settings::WorldSettings;
 pub use shift::Shift;

@@ -51,10 +51,11 @@ impl HostBatch {
         let area = self.length * IMAGE_SIDE * IMAGE_SIDE;
         for row in 0..self.rows {
             let shift = Shift::drawn(pixels, seed, number, row);
-            shift.apply(
-                &mut self.image[row * area * IMAGE_CHANNELS..][..area * IMAGE_CHANNELS],
-                IMAGE_CHANNELS,
-            );
+            let pixels = row * area * IMAGE_CHANNELS..(row + 1) * area * IMAGE_CHANNELS;
+            shift.apply(&mut self.image[pixels.clone()], IMAGE_CHANNELS);
+            if let Some(seen) = self.seen.get_mut(pixels) {
+                shift.apply(seen, IMAGE_CHANNELS);
+            }
             if let Some(masks) = self.robot_mask.get_mut(row * area..(row + 1) * area) {
                 shift.apply(masks, 1);
             }

@@ -138,6 +138,7 @@ pub(super) fn batch(reference: &Reference, device: &Device) -> Result<Batch, Par
     let input = |name: &str| reference.tensor(&format!("input/{name}"), device);
     let first = input("is_first")?.flatten_all()?.to_vec1::<f32>()?;
     Ok(Batch {
+        seen: None,
         image: input("image")?,
         action: input("action")?,
         reward: input("reward")?,

@@ -7,7 +7,7 @@ use rand_chacha::ChaCha8Rng;
 use rcwm_models::episode::Episode;
 use serde::{Deserialize, Serialize};
 
-use crate::learning::HostBatch;
+use crate::learning::{HostBatch, Look, LookSettings};
 
 /// Why an episode was refused or a batch could not be drawn.
 #[derive(Debug, thiserror::Error)]
@@ -88,13 +88,19 @@ pub struct Replay {
     pub(super) capacity: usize,
     pub(super) steps: usize,
     pub(super) next_number: u64,
+    look: LookSettings,
 }
 
 impl Replay {
     /// An empty replay that holds at most `capacity` steps.
     #[must_use]
     pub fn new(capacity: usize) -> Self {
-        Self { tasks: BTreeMap::new(), capacity, steps: 0, next_number: 0 }
+        Self { tasks: BTreeMap::new(), capacity, steps: 0, next_number: 0, look: LookSettings::default() }
+    }
+
+    /// Has the encoders see what is drawn from now on as these settings say.
+    pub fn look(&mut self, settings: &LookSettings) {
+        self.look = *settings;
     }
 
     /// Steps held.
@@ -168,7 +174,7 @@ impl Replay {
     #[must_use]
     pub fn masked(&self) -> Self {
         let mut masked = Self::new(self.capacity);
-        masked.next_number = self.next_number;
+        (masked.next_number, masked.look) = (self.next_number, self.look);
         for (name, task) in &self.tasks {
             let with_mask = |stored: &&Stored| stored.episode.robot_mask.is_some();
             let episodes: VecDeque<_> = task.episodes.iter().filter(with_mask).cloned().collect();
@@ -226,7 +232,8 @@ impl Replay {
                 }
                 _ => generator.random_range(0..task.steps),
             };
-            task.append(name, start, length, masks, &mut batch)?;
+            let look = (!self.look.is_plain()).then(|| self.look.drawn(seed, number, row));
+            task.append(name, start, length, masks, look.as_ref(), &mut batch)?;
         }
         Ok(batch)
     }
@@ -245,8 +252,10 @@ impl Task {
         start: usize,
         length: usize,
         masks: bool,
+        look: Option<&Look>,
         batch: &mut HostBatch,
     ) -> Result<(), ReplayError> {
+        let from = batch.seen.len();
         let (mut index, mut step) = (0, start);
         while step >= self.episodes[index].episode.len() {
             step -= self.episodes[index].episode.len();
@@ -260,9 +269,17 @@ impl Task {
                 Some(place) => append_places(name, episode, *place, step, count, batch)?,
                 None => append_steps(name, episode, step, count, masks, batch)?,
             }
+            if let Some(look) = look {
+                let disturbed = episode.disturbed.as_ref().filter(|_| look.disturbed);
+                let range = ndarray::Slice::from(step..step + count);
+                batch.seen.extend(disturbed.unwrap_or(&episode.image).slice_axis(Axis(0), range));
+            }
             left -= count;
             step = 0;
             index = (index + 1) % self.episodes.len();
+        }
+        if let Some(jitter) = look.and_then(|look| look.jitter) {
+            jitter.apply(&mut batch.seen[from..]);
         }
         Ok(())
     }
@@ -393,6 +410,27 @@ mod tests {
             assert_eq!((anywhere.number, batch.number), (number, number));
         }
         assert!([0, 5, 8].iter().all(|start| (160..240).contains(&seen[*start])), "{seen:?}");
+    }
+
+    #[test]
+    fn the_encoders_see_disturbed_pictures_where_there_are_some_and_the_decoder_draws_the_clean_ones() {
+        let mut replay = Replay::new(100);
+        let disturbed = |steps: usize| Array4::from_elem((steps, 64, 64, 3), 200);
+        replay.add("a", Episode { disturbed: Some(disturbed(4)), ..episode(0, 4, false) }).unwrap();
+        replay.add("a", episode(4, 4, false)).unwrap();
+        assert!(replay.draw(2, 3, false, 7, 0).unwrap().seen.is_empty());
+        let plain = replay.draw(8, 5, false, 7, 3).unwrap();
+        replay.look(&LookSettings { disturbed: 1.0, jitter: 0.0 });
+        let batch = replay.draw(8, 5, false, 7, 3).unwrap();
+        assert_eq!((&batch.image, &batch.reward), (&plain.image, &plain.reward));
+        for (step, reward) in batch.reward.iter().enumerate() {
+            let expected = if *reward < 4.0 { 200 } else { *reward as u8 };
+            assert_eq!(batch.seen[step * 64 * 64 * 3], expected);
+        }
+        replay.look(&LookSettings { disturbed: 0.0, jitter: 1.0 });
+        let batch = replay.draw(8, 5, false, 7, 3).unwrap();
+        assert_eq!(batch.image, plain.image);
+        assert_ne!(batch.seen, batch.image);
     }
 
     #[test]

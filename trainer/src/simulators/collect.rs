@@ -12,7 +12,7 @@ use rcwm_models::tasks::task_name;
 use serde::Serialize;
 
 use super::recorder::{Recorded, Recorder};
-use super::{Client, ClientError, Job, Launch, Plan, SimulatorProcess};
+use super::{Client, ClientError, Job, LEARNING, Launch, Plan, SimulatorProcess};
 
 /// A simulator whose trainer is gone ends by itself after so long.
 const SILENCE_MAX: Duration = Duration::from_secs(60);
@@ -26,6 +26,17 @@ pub enum CollectError {
     /// An episode could not be put together or written.
     #[error(transparent)]
     Episode(#[from] EpisodeError),
+    /// A second look at an episode was not of the same episode.
+    #[error(
+        "episode {path}: with the look {look} the same script did something else; it was collected with other steps, by another version, or changed. \
+         Collect into an empty folder"
+    )]
+    OtherEpisode {
+        /// The file.
+        path: PathBuf,
+        /// The disturbance.
+        look: String,
+    },
     /// A folder could not be made.
     #[error("{path}: {source}")]
     Folder {
@@ -53,7 +64,7 @@ pub struct CollectSettings {
     pub simulators: usize,
     /// Decisions in an episode.
     pub steps_max: u32,
-    /// Visual disturbance: `none`, `textures` or `noise`.
+    /// Visual disturbance: one of [`DISTURBANCES`](super::DISTURBANCES).
     pub disturb: String,
 }
 
@@ -105,6 +116,45 @@ pub fn collect(
     stop: &AtomicBool,
     seen: &(dyn Fn(Seen) + Sync),
 ) -> Result<Sums, CollectError> {
+    run_jobs(plan, settings, stop, seen, &|job, recorded| {
+        recorded.episode.write(&job.file(&settings.out, settings.seed, recorded.number))?;
+        Ok(())
+    })
+}
+
+/// Has the scripts do once more what the episodes of a plan hold, with the disturbance of these settings, and adds what it looks like to
+/// the episodes: [`Episode::disturbed`].
+///
+/// # Errors
+/// See [`CollectError`]; episodes that did not get their pictures are as they were.
+pub fn collect_disturbed(
+    plan: &Plan,
+    settings: &CollectSettings,
+    stop: &AtomicBool,
+    seen: &(dyn Fn(Seen) + Sync),
+) -> Result<(), CollectError> {
+    run_jobs(plan, settings, stop, seen, &|job, recorded| {
+        let path = job.file(&settings.out, settings.seed, recorded.number);
+        let (mut episode, again) = (Episode::read(&path)?, &recorded.episode);
+        if (&episode.action, &episode.reward) != (&again.action, &again.reward) {
+            return Err(CollectError::OtherEpisode { path, look: settings.disturb.clone() });
+        }
+        episode.disturbed = Some(again.image.clone());
+        Ok(episode.write(&path)?)
+    })
+    .map(drop)
+}
+
+/// What becomes of a recorded episode.
+type Keep<'a> = &'a (dyn Fn(&Job, &Recorded) -> Result<(), CollectError> + Sync);
+
+fn run_jobs(
+    plan: &Plan,
+    settings: &CollectSettings,
+    stop: &AtomicBool,
+    seen: &(dyn Fn(Seen) + Sync),
+    keep: Keep<'_>,
+) -> Result<Sums, CollectError> {
     let queue = Mutex::new(plan.jobs.iter());
     let failed = AtomicBool::new(false);
     let worker = |number: usize| -> Result<Sums, CollectError> {
@@ -115,7 +165,7 @@ pub fn collect(
         while let (false, Some(job)) = (ended(stop, &failed), take()) {
             let instance = format!("collect-{}-{number}-{run}", std::process::id());
             run += 1;
-            if let Err(error) = run_job(job, &instance, settings, stop, seen, &mut sums) {
+            if let Err(error) = run_job(job, &instance, settings, stop, seen, keep, &mut sums) {
                 failed.store(true, Ordering::Relaxed);
                 return Err(error);
             }
@@ -156,12 +206,14 @@ fn run_job(
     settings: &CollectSettings,
     stop: &AtomicBool,
     seen: &(dyn Fn(Seen) + Sync),
+    keep: Keep<'_>,
     sums: &mut Sums,
 ) -> Result<(), CollectError> {
     make_folder(&settings.out.join(&job.task))?;
     let process = SimulatorProcess::start(&Launch {
         task: job.task.clone(),
         instance: instance.to_owned(),
+        layouts: LEARNING.to_owned(),
         seed: settings.seed,
         first_episode: job.first_number(),
         episodes: job.episodes,
@@ -174,11 +226,9 @@ fn run_job(
     })?;
     let mut recorder = Recorder::new(Client::of(process)?);
     // The simulator decides by itself: an answer is a receipt.
-    while let Some(Recorded { number, episode, .. }) =
-        recorder.episode(stop, || [0.0; ACTION_LEN], || seen(Seen::Step))?
-    {
-        episode.write(&job.file(&settings.out, settings.seed, number))?;
-        sums.entry((job.task.clone(), job.script.name().to_owned())).or_default().add(&episode);
+    while let Some(recorded) = recorder.episode(stop, || [0.0; ACTION_LEN], || seen(Seen::Step))? {
+        keep(job, &recorded)?;
+        sums.entry((job.task.clone(), job.script.name().to_owned())).or_default().add(&recorded.episode);
         seen(Seen::Episode);
     }
     Ok(())

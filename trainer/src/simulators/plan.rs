@@ -1,5 +1,7 @@
 use std::path::{Path, PathBuf};
 
+use rcwm_models::episode::{Episode, EpisodeError};
+
 /// Who decides while episodes are collected.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord, Hash)]
 pub enum Script {
@@ -14,6 +16,9 @@ pub enum Script {
 }
 
 impl Script {
+    /// The first number that no script's episodes have.
+    pub const END: u64 = 4_000_000;
+
     /// All of them.
     pub const ALL: [Self; 4] = [Self::Expert, Self::Mixed, Self::Random, Self::Pushed];
 
@@ -139,7 +144,7 @@ impl Plan {
         let mut plan = Self::default();
         for task in tasks {
             for script in Script::ALL {
-                plan.add(out, task, script, amounts, seed, run);
+                plan.add(task, script, amounts, run, |index| file(out, task, script, seed, index).exists());
             }
         }
         plan
@@ -151,12 +156,51 @@ impl Plan {
         self.jobs.iter().map(|job| job.episodes).sum()
     }
 
-    fn add(&mut self, out: &Path, task: &str, script: Script, amounts: &Amounts, seed: u64, run: u64) {
+    /// The same for pictures in another look: the episodes that have none yet.
+    ///
+    /// # Errors
+    /// Those of reading an episode that is there.
+    pub fn of_disturbed(
+        out: &Path,
+        tasks: &[String],
+        amounts: &Amounts,
+        seed: u64,
+        run: u64,
+    ) -> Result<Self, EpisodeError> {
+        let amounts = Amounts { masked: 0, ..*amounts };
+        let mut plan = Self::default();
+        let mut failed = None;
+        for task in tasks {
+            for script in Script::ALL {
+                plan.add(task, script, &amounts, run, |index| {
+                    let found = Episode::is_disturbed(&file(out, task, script, seed, index));
+                    found.unwrap_or_else(|error| {
+                        failed.get_or_insert(error);
+                        true
+                    })
+                });
+            }
+        }
+        if let Some(error) = failed {
+            return Err(error);
+        }
+        Ok(plan)
+    }
+
+    /// Episodes of a script for which nothing `is_done` yet.
+    fn add(
+        &mut self,
+        task: &str,
+        script: Script,
+        amounts: &Amounts,
+        run: u64,
+        mut is_done: impl FnMut(u64) -> bool,
+    ) {
         let masked = amounts.masked_of(script);
         let mut open: Option<Job> = None;
         for index in 0..amounts.of(script) {
             let masks = index < masked;
-            if file(out, task, script, seed, index).exists() {
+            if is_done(index) {
                 self.present += 1;
                 self.jobs.extend(open.take());
                 continue;

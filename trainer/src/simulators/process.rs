@@ -7,6 +7,8 @@ use std::time::{Duration, Instant};
 use rcwm_models::episode::STEPS_MAX;
 use rustix::process::{Pid, Signal, kill_process};
 
+use super::LEARNING;
+
 /// How long a simulator may take to end by itself before it is killed.
 const GRACE: Duration = Duration::from_secs(5);
 /// How much of a program's last words is read.
@@ -103,6 +105,8 @@ pub struct Launch {
     pub task: String,
     /// Name of the link.
     pub instance: String,
+    /// The set of layouts: one of [`LAYOUTS`](super::LAYOUTS).
+    pub layouts: String,
     /// Seed of layouts, scripted decisions and disturbances.
     pub seed: u64,
     /// Number of the first episode.
@@ -115,7 +119,7 @@ pub struct Launch {
     pub policy: &'static str,
     /// Whether the robot's mask is rendered.
     pub masks: bool,
-    /// `none`, `textures` or `noise`.
+    /// One of [`DISTURBANCES`](super::DISTURBANCES).
     pub disturb: String,
     /// The simulator's path; where there is none it is searched for.
     pub program: Option<PathBuf>,
@@ -124,12 +128,13 @@ pub struct Launch {
 }
 
 impl Launch {
-    /// Endless episodes of a task, for a remote policy, without masks.
+    /// Endless episodes of a task on layouts to learn from, for a remote policy, without masks.
     #[must_use]
     pub fn remote(task: &str, instance: &str, seed: u64) -> Self {
         Self {
             task: task.to_owned(),
             instance: instance.to_owned(),
+            layouts: LEARNING.to_owned(),
             seed,
             first_episode: 0,
             episodes: 0,
@@ -164,7 +169,7 @@ impl SimulatorProcess {
         command
             .args(["serve", "--pace", "lockstep", "--task", &launch.task, "--instance", &launch.instance])
             .args(["--policy", launch.policy, "--disturb", &launch.disturb])
-            .args(["--seed", &launch.seed.to_string()])
+            .args(["--layouts", &launch.layouts, "--seed", &launch.seed.to_string()])
             .args(["--first-episode", &launch.first_episode.to_string()])
             .args(["--episodes", &launch.episodes.to_string()])
             .args(["--steps-max", &launch.steps_max.to_string()])

@@ -56,6 +56,8 @@ pub enum Spent {
     Learning,
     /// Deciding on actions, and keeping what came of them.
     Acting,
+    /// Separate episodes.
+    Evaluating,
     /// Until simulators had answered.
     WaitingForSimulators,
     /// Until batches were drawn.
@@ -67,6 +69,7 @@ impl Spent {
         match self {
             Self::Learning => "learning_share",
             Self::Acting => "acting_share",
+            Self::Evaluating => "evaluating_share",
             Self::WaitingForSimulators => "waiting_for_simulators_share",
             Self::WaitingForBatches => "waiting_share",
         }

@@ -83,6 +83,7 @@ impl WorldUpdates {
                 }
                 Self::Tensors { learner: Box::new(learner), device }
             }
+            Compute::Programs(_) if !settings.replay.look.is_plain() => return Err(TrainingError::LookOnGpu),
             Compute::Programs(machine) => {
                 let adam = adam.unwrap_or_else(|| Adam::new(settings.world.adam.clone()));
                 Self::Waiting { machine: Some(machine), adam }
@@ -199,6 +200,7 @@ impl AgentUpdates {
                 behaviour: Box::new(BehaviourLearner::new(parameters, model, behaviour)?),
                 device,
             },
+            Compute::Programs(_) if !settings.replay.look.is_plain() => return Err(TrainingError::LookOnGpu),
             Compute::Programs(machine) => {
                 let plan = GpuPlan {
                     model,

@@ -256,7 +256,8 @@ impl Fewshot {
         let seed = self.settings.seed;
         if stage != Stage::Actor || fewshot.world_goes_on {
             if work.batches.is_none() {
-                let (sizes, replay) = (self.settings.replay.clone(), work.replay.clone());
+                let (sizes, mut replay) = (self.settings.replay.clone(), work.replay.clone());
+                replay.look(&sizes.look);
                 let (shift, starts) = (fewshot.shift, fewshot.starts);
                 work.batches = Some(Prefetch::start(self.state.updates, sizes.prefetch, move |number| {
                     let seed = seed ^ REPLAY_STREAM;

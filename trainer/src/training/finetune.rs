@@ -6,10 +6,11 @@ use candle_core::Device;
 use serde_json::json;
 
 use super::compute::{AgentUpdates, Compute};
+use super::evaluations::evaluate;
 use super::film::{Scene, write_films};
 use super::prefill::{Prefilled, policy_episode, prefill};
 use super::run::GoesOn;
-use super::{EpisodeFacts, EpisodeLine, OnlineOutcome, OnlineProgress};
+use super::{EpisodeFacts, EpisodeLine, EvaluationLine, OnlineOutcome, OnlineProgress};
 use super::{Interval, Phase, Run, Spent, TrainingError, TrainingSettings, TrainingState, start_from};
 use crate::acting::{Fleet, Gathered, Policy, Recorded};
 use crate::checkpoint::Checkpoint;
@@ -17,7 +18,7 @@ use crate::model::agent::{self, Agent};
 use crate::model::latent::Sampler;
 use crate::model::parameters::{ParameterError, Parameters};
 use crate::replay::{Prefetch, SharedReplay};
-use crate::simulators::{Launch, Seen};
+use crate::simulators::{Launch, Script, Seen};
 
 /// Names of the optimisers in checkpoints.
 const OPTIMISERS: [&str; 3] = ["world", "actor", "critic"];
@@ -25,7 +26,7 @@ const OPTIMISERS: [&str; 3] = ["world", "actor", "critic"];
 const REPLAY_STREAM: u64 = 0x7265_706c_6179;
 const ACTING_STREAM: u64 = 0x0061_6374_696e;
 /// Numbers of the policy's episodes, and with them their layouts, begin behind those of the scripts; each simulator has its own.
-const FIRST_EPISODE: u64 = 3_000_000;
+const FIRST_EPISODE: u64 = Script::END;
 const EPISODES_A_SIMULATOR: u64 = 1_000_000;
 /// Steps of the environment in one decision of the policy.
 const ACTION_REPEAT: u64 = 2;
@@ -49,6 +50,8 @@ pub struct Finetuning {
     state: TrainingState,
     newest: VecDeque<bool>,
     refused_actions: u64,
+    /// Evaluations that are behind it.
+    evaluations: u64,
     scenes: Vec<Scene>,
 }
 
@@ -97,13 +100,19 @@ impl Finetuning {
         let device = compute.device();
         let updates = AgentUpdates::new(compute, &settings, &parameters)?;
         Ok(Self {
-            settings,
             device,
             folder: folder.to_path_buf(),
             run,
             parameters,
             updates,
             acting_since: state.updates,
+            // That of a checkpoint's own step was made before it.
+            evaluations: if state.policy_steps > 0 {
+                settings.finetune.evaluation.due(state.policy_steps)
+            } else {
+                0
+            },
+            settings,
             state,
             newest: VecDeque::new(),
             refused_actions: 0,
@@ -182,7 +191,9 @@ impl Finetuning {
         let most = self.settings.finetune.success_episodes;
         self.newest = filled.policy_successes.iter().rev().take(most).rev().copied().collect();
         self.scenes = self.settings.film.scenes(&filled.replay);
-        let replay = SharedReplay::new(filled.replay);
+        let mut replay = filled.replay;
+        replay.look(&self.settings.replay.look);
+        let replay = SharedReplay::new(replay);
         let mut learning = Learning { batches: self.prefetch(&replay)?, interval: Interval::begin() };
         let done = self.work(&replay, &mut learning, join, stop, &mut show);
         // What ended the work says more than what fails after it.
@@ -216,6 +227,7 @@ impl Finetuning {
         if stop.load(Ordering::Relaxed) || self.state.policy_steps >= steps {
             return Ok(());
         }
+        self.evaluate(learning, stop, show)?;
         let mut fleet = Fleet::new(&self.launches(), join)?;
         let agent = Agent::new(&self.parameters.frozen(), &self.settings.model)?;
         let mut policy = Policy::new(agent, fleet.len(), &self.device);
@@ -234,6 +246,7 @@ impl Finetuning {
             learning.interval.add(Spent::Acting, begin.elapsed());
             drop(gathered);
             self.learn(learning, stop, show)?;
+            self.evaluate(learning, stop, show)?;
         }
         Ok(())
     }
@@ -260,6 +273,31 @@ impl Finetuning {
         self.refused_actions += refused;
         if refused > 0 {
             check_finite(&self.parameters)?;
+        }
+        Ok(())
+    }
+
+    /// Makes the evaluation that is due.
+    fn evaluate(
+        &mut self,
+        learning: &mut Learning,
+        stop: &AtomicBool,
+        show: &mut impl FnMut(&OnlineProgress<'_>),
+    ) -> Result<(), TrainingError> {
+        let due = self.settings.finetune.evaluation.due(self.state.policy_steps);
+        if due <= self.evaluations || stop.load(Ordering::Relaxed) {
+            return Ok(());
+        }
+        self.write_back()?;
+        let agent = Agent::new(&self.parameters.frozen(), &self.settings.model)?;
+        let steps = (self.state.policy_steps, ACTION_REPEAT * self.state.policy_steps);
+        let found =
+            learning.interval.time(Spent::Evaluating, || evaluate(agent, &self.settings, steps, stop))?;
+        if let Some(evaluation) = found {
+            self.evaluations = due;
+            let line = EvaluationLine { update: self.state.updates, phase: ONLINE, evaluation };
+            self.run.log(&line)?;
+            show(&OnlineProgress { evaluation: Some(&line), ..self.progress() });
         }
         Ok(())
     }
@@ -409,6 +447,7 @@ impl Finetuning {
             updates: self.state.updates,
             policy_steps: self.state.policy_steps,
             line: None,
+            evaluation: None,
             episode: None,
             success_rate: self.success_rate(),
         }

@@ -39,6 +39,7 @@ mod averages;
 mod compute;
 mod curves;
 mod demonstrations;
+mod evaluations;
 mod fewshot;
 mod film;
 mod finetune;
@@ -58,6 +59,7 @@ mod weight_average;
 pub use averages::{Averages, Interval, Line, Spent};
 pub use compute::Compute;
 pub use demonstrations::demonstrations;
+pub use evaluations::{EvaluationFacts, EvaluationLine, EvaluationSettings};
 pub use fewshot::{Fewshot, Stage};
 pub use film::{FilmSettings, film};
 pub use finetune::Finetuning;
@@ -89,6 +91,14 @@ pub enum TrainingError {
     /// An earlier try could not set up the GPU and gave it back.
     #[error("the GPU was given back when setting up failed; start the run again")]
     NoMachine,
+    /// The episodes that a run is judged by could not be run.
+    #[error("evaluation: {0}")]
+    Evaluation(#[source] Box<crate::evaluation::ClosedLoopError>),
+    /// What programs do not do yet.
+    #[error(
+        "replay.look: updates on a GPU see pictures as they are; set replay.look.disturbed and replay.look.jitter to 0, or leave out --device"
+    )]
+    LookOnGpu,
     /// The folder holds a run.
     #[error("{path} holds a run already; say --resume, or choose another folder")]
     Exists {

@@ -2,7 +2,7 @@
 
 use serde::Serialize;
 
-use super::Line;
+use super::{EvaluationLine, Line};
 
 /// One episode of the policy, as a line of metrics tells it.
 #[derive(Debug, Clone, PartialEq, Serialize)]
@@ -44,6 +44,8 @@ pub struct OnlineProgress<'a> {
     pub policy_steps: u64,
     /// The newest line of metrics, when there is a new one.
     pub line: Option<&'a Line>,
+    /// The evaluation that has just been made.
+    pub evaluation: Option<&'a EvaluationLine>,
     /// The episode that has just ended.
     pub episode: Option<&'a EpisodeLine>,
     /// Share of successes in the newest episodes; none before the first.

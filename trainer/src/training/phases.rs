@@ -3,8 +3,10 @@ use rcwm_models::episode::STEPS_MAX;
 use rcwm_models::settings::{Preset, SettingsError};
 use serde::{Deserialize, Serialize};
 
+use super::EvaluationSettings;
 use crate::cloning::{CloningSettings, Ramp};
 use crate::replay::Starts;
+use crate::simulators::DISTURBANCES;
 
 /// What a run is.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default, Serialize, Deserialize)]
@@ -172,8 +174,10 @@ pub struct FinetuneSettings {
     pub episode_steps: u32,
     /// Whether the simulators render robot masks and the world model learns from them.
     pub masks: bool,
-    /// Visual disturbance: `none`, `textures` or `noise`.
+    /// Visual disturbance: one of [`DISTURBANCES`].
     pub disturb: String,
+    /// Separate episodes that it is judged by while it learns.
+    pub evaluation: EvaluationSettings,
     /// The newest episodes of which the success rate is told; that of the best checkpoint is the highest.
     pub success_episodes: usize,
 }
@@ -192,6 +196,7 @@ impl Default for FinetuneSettings {
             episode_steps: 250,
             masks: false,
             disturb: "none".to_owned(),
+            evaluation: EvaluationSettings::default(),
             success_episodes: 20,
         }
     }
@@ -241,10 +246,14 @@ impl FinetuneSettings {
                 "finetune.expert_episodes and finetune.random_steps are both 0, but there must be something to replay".into(),
             );
         }
-        if !matches!(self.disturb.as_str(), "none" | "textures" | "noise") {
+        if let Some(text) = self.evaluation.invalid() {
+            return invalid(text);
+        }
+        if !DISTURBANCES.contains(&self.disturb.as_str()) {
             return invalid(format!(
-                "finetune.disturb = {:?}, expected \"none\", \"textures\" or \"noise\"",
-                self.disturb
+                "finetune.disturb = {:?}, expected one of {}",
+                self.disturb,
+                DISTURBANCES.join(", ")
             ));
         }
         Ok(())

@@ -126,6 +126,7 @@ impl Pretraining {
         let (mut replay, mut held_out) = replay.hold_out(self.settings.replay.held_out_episodes);
         self.learner.begin(&self.settings, &self.parameters, &self.run, [&mut replay, &mut held_out])?;
         let judge = Judge::new(&self.settings, &replay, held_out);
+        replay.look(&self.settings.replay.look);
         let mut batches = self.prefetch(replay)?;
         let mut interval = Interval::begin(&batches);
         let mut since_checkpoint = Means::default();

@@ -5,7 +5,7 @@ use serde::{Deserialize, Serialize};
 
 use super::{FewshotSettings, FilmSettings, FinetuneSettings, Phase, ResetSettings};
 use crate::behaviour::BehaviourSettings;
-use crate::learning::WorldSettings;
+use crate::learning::{LookSettings, WorldSettings};
 
 /// Everything that can be chosen for a run. The resolved settings are written into its folder.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
@@ -93,6 +93,8 @@ pub struct ReplaySettings {
     pub held_out_episodes: usize,
     /// Batches of them that a checkpoint is judged by, the same for every checkpoint.
     pub held_out_batches: usize,
+    /// How the encoders see what is learned from.
+    pub look: LookSettings,
 }
 
 impl Default for ReplaySettings {
@@ -105,6 +107,7 @@ impl Default for ReplaySettings {
             prefetch: 4,
             held_out_episodes: 2,
             held_out_batches: 4,
+            look: LookSettings::default(),
         }
     }
 }
@@ -211,6 +214,9 @@ impl TrainingSettings {
             if value < least {
                 return Err(SettingsError::Invalid(format!("{name} = {value}, expected at least {least}")));
             }
+        }
+        if let Some(text) = replay.look.invalid() {
+            return Err(SettingsError::Invalid(text));
         }
         if !(1..=replay.length).contains(&self.world.paint_every) {
             return Err(SettingsError::Invalid(format!(
