@@ -11,9 +11,10 @@ use rcwm_models::settings::ModelKind;
 use rcwm_models::tasks::task_id;
 use rcwm_trainer::checkpoint::Checkpoint;
 use rcwm_trainer::evaluation::{
-    ClosedLoopReport, ClosedLoopResults, ClosedLoopSettings, Comparison, Latents, Measure, Measured,
-    ModelReport, OpenLoopReport, OpenLoopSettings, Position, TRAINER_ENGINE, TaskReport, TaskTrajectories,
-    closed_loop, closed_loop_in_trainer, measure,
+    AttentionFilm, ClosedLoopReport, ClosedLoopResults, ClosedLoopSettings, Comparison, EvaluationError,
+    Latents, Measure, Measured, ModelReport, OpenLoopReport, OpenLoopSettings, OtherActions, OverSeeds,
+    Position, Recordings, TRAINER_ENGINE, TaskReport, TaskTrajectories, Trained, Windows, closed_loop,
+    closed_loop_in_trainer, measure,
 };
 use rcwm_trainer::export::{self, ExportError, Options};
 use rcwm_trainer::model::agent::Agent;
@@ -40,7 +41,10 @@ use super::report::{Inputs, ReportArguments};
 With --data (paper, Fig. 4 and 7): every model sees some steps of the same trajectories and
 imagines the rest with the recorded actions. The robot dynamics error is the squared error between
 imagined and true picture, both multiplied by the true robot mask, mean over the whole picture;
-the episodes need masks. With --task: the policy is exported and deployed by rcwm-runtime in
+the episodes need masks. Beside it stands the error on the pixels outside the robot that move, and
+what other actions from the same start change in the imagined pictures. Windows end before the task
+is solved and the robot moves in them (--windows anywhere takes all). Checkpoints that differ in
+their training seed only are taken together: then intervals are over seeds. With --task: the policy is exported and deployed by rcwm-runtime in
 rcwm-simulator, in lock-step; a vanilla model, which no runtime deploys, decides in this process.
 With --report: both, as one page that shows all that lies in the folder's parts; a part is measured
 again only if it is asked for from something else. Ctrl-C keeps what is done.")]
@@ -64,6 +68,12 @@ pub struct Evaluate {
     /// Steps that are imagined after them
     #[arg(long, default_value_t = 54, value_name = "N")]
     imagined: usize,
+    /// Which windows of the episodes: those that end before the task is solved and in which the robot moves, or all
+    #[arg(long, value_enum, default_value = "moving")]
+    windows: WindowsName,
+    /// What the recorded actions are compared with, from the same start
+    #[arg(long, value_enum, default_value = "still")]
+    other_actions: OtherActionsName,
     /// Take the most probable latents and actions, or draw them [default: sample with --data, mode with --task]
     #[arg(long, value_enum)]
     latents: Option<LatentsName>,
@@ -124,6 +134,22 @@ enum LatentsName {
     Mode,
 }
 
+#[derive(Debug, Clone, Copy, PartialEq, Eq, clap::ValueEnum)]
+enum WindowsName {
+    /// They end before success, and the robot moves at half of the imagined steps or more; at least 15 imagined steps.
+    Moving,
+    /// Also those in which the robot holds still or that go on after success.
+    Anywhere,
+}
+
+#[derive(Debug, Clone, Copy, PartialEq, Eq, clap::ValueEnum)]
+enum OtherActionsName {
+    /// The robot holds still.
+    Still,
+    /// The recorded motion the other way.
+    Mirrored,
+}
+
 impl Evaluate {
     pub fn run(self) -> Result<ExitCode> {
         let stop = super::stop_on_ctrl_c()?;
@@ -171,7 +197,16 @@ impl Evaluate {
         let (trajectories, context, imagined) = (self.trajectories, self.context, self.imagined);
         ensure!(context > 0 && imagined > 0, "--context and --imagined: expected at least 1");
         ensure!(trajectories > 0, "--trajectories: expected at least 1");
-        Ok(OpenLoopSettings { trajectories, context, imagined, latents, seed: self.seed, films })
+        let windows = match self.windows {
+            WindowsName::Moving => Windows::Moving,
+            WindowsName::Anywhere => Windows::Anywhere,
+        };
+        let other_actions = Some(match self.other_actions {
+            OtherActionsName::Still => OtherActions::Still,
+            OtherActionsName::Mirrored => OtherActions::Mirrored,
+        });
+        let seed = self.seed;
+        Ok(OpenLoopSettings { trajectories, context, imagined, latents, seed, films, windows, other_actions })
     }
 
     fn open_loop(&self, data: &Path, stop: &AtomicBool) -> Result<()> {
@@ -212,12 +247,11 @@ impl Evaluate {
         let folder = Folder::list(data, self.masks.as_deref())?;
         let bar = ProgressBar::new(folder.len() as u64)
             .with_style(ProgressStyle::with_template("loading {wide_bar} {pos}/{len} episodes")?);
-        let replay = folder.load_where(|episode| episode.robot_mask.is_some(), usize::MAX, || bar.inc(1))?;
+        let recordings = Recordings::load(&folder, || bar.inc(1))?;
         bar.finish_and_clear();
-        let length = settings.context + settings.imagined;
-        let tasks = TaskTrajectories::choose(&replay, settings.trajectories, length, settings.seed)?;
+        let tasks = TaskTrajectories::choose(&recordings, settings)?;
         for task in &tasks {
-            println!("{}: {} trajectories of {} episodes", task.task, task.chosen.len(), task.episodes());
+            println!("{}", task.summary(settings.context));
         }
         Ok(tasks)
     }
@@ -241,8 +275,11 @@ impl Evaluate {
             for (index, task) in tasks.iter().enumerate() {
                 bar.set_message(format!("{name} on {}", task.task));
                 let measured = measure(&agent, task, settings, device, stop, |rows| bar.inc(rows as u64))?;
-                self.write_films(name, &task.task, &measured)?;
-                reports.push(TaskReport::of(task, &measured, settings.seed));
+                let attention = || {
+                    AttentionFilm::of(&agent, task, settings.context, settings.latents, settings.seed, device)
+                };
+                self.write_films(name, &task.task, &measured, attention)?;
+                reports.push(TaskReport::of(task, &measured, settings));
                 match (first.get(index), &report.models.first()) {
                     (Some(other), Some(against)) => report.comparisons.extend(Comparison::of(
                         task,
@@ -250,7 +287,7 @@ impl Evaluate {
                         (&against.name, other),
                         settings.seed,
                     )),
-                    _ => first.push(Measured { films: Vec::new(), ..measured }),
+                    _ => first.push(Measured { films: Vec::new(), response_films: Vec::new(), ..measured }),
                 }
             }
             let settings = &checkpoint.settings;
@@ -259,15 +296,29 @@ impl Evaluate {
                 checkpoint: path.display().to_string(),
                 kind: settings.model.kind,
                 preset: settings.preset.clone(),
+                seed: settings.seed,
                 updates: settings.updates,
                 tasks: reports,
             });
         }
+        let trained = models.iter().zip(&report.models).map(|((name, _, checkpoint), report)| Trained {
+            name,
+            settings: &checkpoint.settings,
+            tasks: &report.tasks,
+        });
+        report.over_seeds = OverSeeds::of(&trained.collect::<Vec<_>>(), settings.seed);
         bar.finish_and_clear();
         Ok(report)
     }
 
-    fn write_films(&self, model: &str, task: &str, measured: &Measured) -> Result<()> {
+    /// Films of what was measured, and the first trajectory's attention, which `attention` makes.
+    fn write_films(
+        &self,
+        model: &str,
+        task: &str,
+        measured: &Measured,
+        attention: impl Fn() -> Result<Option<AttentionFilm>, EvaluationError>,
+    ) -> Result<()> {
         let Some(out) = &self.out else { return Ok(()) };
         let films = out.join("films");
         std::fs::create_dir_all(&films).with_context(|| format!("--out {}", films.display()))?;
@@ -275,6 +326,19 @@ impl Evaluate {
             let stem = format!("{}-{task}-{number}", model.replace('/', "-"));
             film.write_strip(STRIP_EVERY, &films.join(format!("{stem}.png")))?;
             film.write_gif(&films.join(format!("{stem}.gif")))?;
+        }
+        for (number, film) in measured.response_films.iter().enumerate() {
+            let stem = format!("{}-{task}-{number}-response", model.replace('/', "-"));
+            film.write_strip(STRIP_EVERY, &films.join(format!("{stem}.png")))?;
+            film.write_gif(&films.join(format!("{stem}.gif")))?;
+        }
+        if !measured.films.is_empty()
+            && let Some(film) = attention()?
+        {
+            film.write_strip(
+                STRIP_EVERY,
+                &films.join(format!("{}-{task}-attention.png", model.replace('/', "-"))),
+            )?;
         }
         Ok(())
     }

@@ -9,9 +9,9 @@ use candle_core::Device;
 use indicatif::{ProgressBar, ProgressStyle};
 use rcwm_trainer::checkpoint::Checkpoint;
 use rcwm_trainer::evaluation::{
-    ClosedLoopSettings, EvaluationError, OpenLoopSettings, Position, TaskTrajectories,
+    ClosedLoopSettings, EvaluationError, OpenLoopSettings, Position, Recordings, TaskTrajectories,
 };
-use rcwm_trainer::replay::{Folder, Replay};
+use rcwm_trainer::replay::Folder;
 use rcwm_trainer::report::{
     AttentionPart, Dynamics, Made, Policy, Report, ReportError, Results, Store, Subject, Success,
     UNDISTURBED, policies, shown_path,
@@ -220,13 +220,13 @@ impl Work<'_> {
 
     /// What is missing of one task.
     fn task(&mut self, data: &TaskData, subjects: &[Subject], bar: &ProgressBar) -> Result<()> {
-        let mut replay = None;
+        let mut recordings = None;
         for subject in subjects {
-            self.dynamics(data, subject, &mut replay, bar)?;
+            self.dynamics(data, subject, &mut recordings, bar)?;
         }
         if data.disturb == UNDISTURBED {
             for subject in subjects.iter().filter(|subject| subject.has_attention()) {
-                self.attention(data, subject, &mut replay)?;
+                self.attention(data, subject, &mut recordings)?;
             }
         }
         Ok(())
@@ -236,7 +236,7 @@ impl Work<'_> {
         &mut self,
         data: &TaskData,
         subject: &Subject,
-        replay: &mut Option<Replay>,
+        recordings: &mut Option<Recordings>,
         bar: &ProgressBar,
     ) -> Result<()> {
         let (settings, device) = (self.inputs.open_loop, &self.inputs.device);
@@ -245,10 +245,10 @@ impl Work<'_> {
             self.found += 1;
             return Ok(());
         }
-        let Some(replay) = self.loaded(replay, data)? else { return Ok(()) };
+        let Some(recordings) = self.loaded(recordings, data)? else { return Ok(()) };
         bar.set_message(format!("{} on {}, disturbance {}", subject.name, data.task, data.disturb));
-        let (begin, length) = (Instant::now(), settings.context + settings.imagined);
-        let chosen = TaskTrajectories::choose(replay, settings.trajectories, length, settings.seed)?;
+        let begin = Instant::now();
+        let chosen = TaskTrajectories::choose(recordings, &settings)?;
         // Folders are of one task each.
         let Some(task) = chosen.first() else { return Ok(()) };
         let mut draft = self.store.draft::<Dynamics>(&source)?;
@@ -261,7 +261,12 @@ impl Work<'_> {
         Ok(())
     }
 
-    fn attention(&mut self, data: &TaskData, subject: &Subject, replay: &mut Option<Replay>) -> Result<()> {
+    fn attention(
+        &mut self,
+        data: &TaskData,
+        subject: &Subject,
+        recordings: &mut Option<Recordings>,
+    ) -> Result<()> {
         let source = subject.attention_source(&data.task, &data.sha256, &self.inputs.open_loop);
         if self.store.find::<AttentionPart>(&source).is_some() {
             self.found += 1;
@@ -270,10 +275,10 @@ impl Work<'_> {
         if self.stop.load(Ordering::Relaxed) {
             return Err(ReportError::from(EvaluationError::Interrupted).into());
         }
-        let Some(replay) = self.loaded(replay, data)? else { return Ok(()) };
+        let Some(recordings) = self.loaded(recordings, data)? else { return Ok(()) };
         let begin = Instant::now();
         let mut draft = self.store.draft::<AttentionPart>(&source)?;
-        if let Some(part) = subject.attend(replay, &source, &self.inputs.device, &mut draft)? {
+        if let Some(part) = subject.attend(recordings, &source, &self.inputs.device, &mut draft)? {
             self.store.keep(draft, source, part, self.made(), begin.elapsed().as_secs_f64())?;
             self.measured += 1;
         }
@@ -281,17 +286,20 @@ impl Work<'_> {
     }
 
     /// The task's episodes with masks, read once; none where there are none.
-    fn loaded<'r>(&self, replay: &'r mut Option<Replay>, data: &TaskData) -> Result<Option<&'r Replay>> {
-        if replay.is_none() {
+    fn loaded<'r>(
+        &self,
+        recordings: &'r mut Option<Recordings>,
+        data: &TaskData,
+    ) -> Result<Option<&'r Recordings>> {
+        if recordings.is_none() {
             let bar = ProgressBar::new(data.folder.len() as u64)
                 .with_style(ProgressStyle::with_template("loading {msg} {wide_bar} {pos}/{len} episodes")?)
                 .with_message(data.task.clone());
-            let masked = |episode: &rcwm_models::episode::Episode| episode.robot_mask.is_some();
-            let read = data.folder.load_where(masked, usize::MAX, || bar.inc(1));
+            let read = Recordings::load(&data.folder, || bar.inc(1));
             bar.finish_and_clear();
-            *replay = Some(read?);
+            *recordings = Some(read?);
         }
-        let found = replay.as_ref().filter(|replay| replay.episodes() > 0);
+        let found = recordings.as_ref().filter(|recordings| !recordings.is_empty());
         if found.is_none() {
             println!("{}, disturbance {}: no episode has masks, not measured", data.task, data.disturb);
         }

@@ -1,12 +1,12 @@
 use std::path::Path;
 
-use candle_core::{DType, Device};
+use candle_core::{DType, Device, Tensor};
 use image::{Rgb, RgbImage};
 use serde::{Deserialize, Serialize};
 
 use super::film::{CELL, GAP, LETTERS, WORDS_HEIGHT};
 use super::open_loop::{filtered, joined};
-use super::{EvaluationError, Film, Latents, TaskTrajectories};
+use super::{AttentionMaps, AttentionSpread, EvaluationError, Film, Latents, TaskTrajectories};
 use crate::model::agent::Agent;
 use crate::model::latent::Sampler;
 use crate::plots::{
@@ -17,6 +17,8 @@ use crate::plots::{
 const SHOWN: [&str; 4] = ["true", "imagined", "robot", "environment"];
 /// Between the part of a map that looks at z and the one that looks at h.
 const PART_GAP: u32 = 3;
+/// The brightest colour stands for this many times the weight that every row gets if all get the same, and for all above.
+const BRIGHTEST_TIMES_EVEN: f32 = 4.0;
 /// Size of the colour scale.
 const SCALE_SIZE: (u32, u32) = (256, 14);
 /// Dark to bright, evenly for the eye and in grey too (after viridis).
@@ -36,6 +38,9 @@ pub struct Attention {
     pub share_of_h: Vec<f64>,
     /// Largest single weight.
     pub largest: Vec<f64>,
+    /// How it is spread over queries and the imagined states.
+    #[serde(default)]
+    pub spread: Option<AttentionSpread>,
 }
 
 /// What a model imagined of one trajectory, and what its environment branch asked of the robot branch at every imagined step (eq. 7;
@@ -79,8 +84,7 @@ impl AttentionFilm {
         let decoded = world.decode(&joined(&seen, &imagined)?)?;
         let film = Film::of(&batch.image, &decoded, 0, context)?;
         let (_, steps, queries, keys) = maps.dims4()?;
-        let map = |t| maps.get(0)?.get(t)?.flatten_all()?.to_dtype(DType::F32)?.to_vec1();
-        let maps = (0..steps).map(map).collect::<candle_core::Result<_>>()?;
+        let maps = maps_of(&maps, 0, steps)?;
         Ok(Some(Self { film, context, maps, queries, keys }))
     }
 
@@ -92,12 +96,15 @@ impl AttentionFilm {
             let sum: f64 = rows.flat_map(|row| &row[self.queries..]).map(|weight| f64::from(*weight)).sum();
             sum / self.queries as f64
         };
+        let mut all = AttentionMaps::new(self.queries);
+        all.extend(self.maps.iter().cloned());
         Attention {
             queries: self.queries,
             keys: self.keys,
             rows_of_h: self.keys - self.queries,
             share_of_h: self.maps.iter().map(share).collect(),
             largest: self.maps.iter().map(|map| f64::from(largest(map))).collect(),
+            spread: all.spread(),
         }
     }
 
@@ -119,7 +126,6 @@ impl AttentionFilm {
         let width = (left + shown.len() as u32 * (CELL + GAP)).max(left + SCALE_SIZE.0 + 2 * CELL);
         let mut strip = RgbImage::from_pixel(width, height, Rgb(PAPER));
         self.write_titles(&mut strip, top_of_maps)?;
-        let range = self.range();
         for (column, step) in shown.into_iter().enumerate() {
             let (x, t) = (left + column as u32 * (CELL + GAP), self.context + step);
             write_text(&mut strip, (x as i32, 3), LETTERS, INK, &self.film.describe(t))?;
@@ -128,9 +134,9 @@ impl AttentionFilm {
                     self.film.draw(&mut strip, (x, WORDS_HEIGHT + row as u32 * (CELL + GAP)), panel, t);
                 }
             }
-            self.draw_map(&mut strip, (x, top_of_maps), &self.maps[step], range);
+            self.draw_map(&mut strip, (x, top_of_maps), &self.maps[step]);
         }
-        self.draw_scale(&mut strip, (left, top_of_maps + map_height + WORDS_HEIGHT / 2), range)?;
+        self.draw_scale(&mut strip, (left, top_of_maps + map_height + WORDS_HEIGHT / 2))?;
         Ok(strip)
     }
 
@@ -159,46 +165,46 @@ impl AttentionFilm {
         Ok(())
     }
 
-    /// Least and largest weight of the whole film: attention is often nearly even, and colours from 0 on would hide what there is.
-    fn range(&self) -> (f32, f32) {
-        let weights = || self.maps.iter().flatten().copied();
-        let (least, most) = (weights().fold(f32::INFINITY, f32::min), weights().fold(0.0, f32::max));
-        (least, most.max(least + f32::EPSILON))
+    /// The weight that the brightest colour stands for. Colours begin at 0 and are the same in every film of a model's size: what looks even
+    /// is even.
+    fn brightest(&self) -> f32 {
+        (BRIGHTEST_TIMES_EVEN / self.keys as f32).min(1.0)
     }
 
-    fn draw_map(&self, on: &mut RgbImage, (left, top): (u32, u32), map: &[f32], (least, most): (f32, f32)) {
+    fn draw_map(&self, on: &mut RgbImage, (left, top): (u32, u32), map: &[f32]) {
         let pixel = self.pixel();
         for (query, weights) in map.chunks_exact(self.keys).enumerate() {
             for (key, weight) in weights.iter().enumerate() {
                 let gap = if key < self.queries { 0 } else { PART_GAP };
                 let (x, y) = (left + query as u32 * pixel, top + gap + key as u32 * pixel);
-                fill(on, (x, y), (pixel, pixel), colour((weight - least) / (most - least)));
+                fill(on, (x, y), (pixel, pixel), colour(weight / self.brightest()));
             }
         }
     }
 
-    /// The colours from the least to the largest weight, with a mark where every row gets the same.
-    fn draw_scale(
-        &self,
-        on: &mut RgbImage,
-        (left, top): (u32, u32),
-        (least, most): (f32, f32),
-    ) -> Result<(), PlotError> {
+    /// The colours from 0 to the brightest, with marks where every row gets the same and at the film's largest weight.
+    fn draw_scale(&self, on: &mut RgbImage, (left, top): (u32, u32)) -> Result<(), PlotError> {
         let ((width, height), below) = (SCALE_SIZE, (top + SCALE_SIZE.1 + 4) as i32);
-        let words = |value: f32| format!("{value:.4}");
         let mut x = left;
-        write_text(on, (x as i32, top as i32), LETTERS, INK, &words(least))?;
-        x += text_width(LETTERS, &words(least))? + 2 * GAP;
+        write_text(on, (x as i32, top as i32), LETTERS, INK, "0")?;
+        x += text_width(LETTERS, "0")? + 2 * GAP;
         for step in 0..width {
             fill(on, (x + step, top), (1, height), colour(step as f32 / (width - 1) as f32));
         }
+        let place = |weight: f32| (weight / self.brightest()).clamp(0.0, 1.0) * (width - 1) as f32;
         let even = 1.0 / self.keys as f32;
-        let place = ((even - least) / (most - least)).clamp(0.0, 1.0) * (width - 1) as f32;
-        let mark = x + place.round() as u32;
-        fill(on, (mark, top), (1, height + 4), INK);
-        write_text(on, (mark as i32, below), LETTERS, INK, &format!("{}: even", words(even)))?;
+        let most = self.maps.iter().map(|map| largest(map)).fold(0.0, f32::max);
+        for (weight, mark, words) in [(even, height + 4, "even"), (most, height + 2, "largest")] {
+            let at = x + place(weight).round() as u32;
+            fill(on, (at, top), (1, mark), if weight > even { PAPER } else { INK });
+            let words = format!("{weight:.4}: {words}");
+            // The two may be as good as the same: words of the larger begin at the right half or after those of the smaller.
+            let from = if mark > height + 2 { at } else { at.max(x + place(even) as u32 + SCALE_SIZE.0 / 2) };
+            write_text(on, (from as i32, below), LETTERS, INK, &words)?;
+        }
         let beside = (x + width + 2 * GAP) as i32;
-        write_text(on, (beside, top as i32), LETTERS, INK, &words(most))
+        let words = format!("{:.4} and more ({BRIGHTEST_TIMES_EVEN} x even)", self.brightest());
+        write_text(on, (beside, top as i32), LETTERS, INK, &words)
     }
 }
 
@@ -227,6 +233,12 @@ impl Attention {
             panel("largest weight", &self.largest, 1.0 / keys, COLOURS[1]),
         ]
     }
+}
+
+/// The maps [B, L, n, n+k] of the first steps of a row, each flattened.
+pub(super) fn maps_of(maps: &Tensor, row: usize, steps: usize) -> candle_core::Result<Vec<Vec<f32>>> {
+    let row = maps.get(row)?;
+    (0..steps).map(|t| row.get(t)?.flatten_all()?.to_dtype(DType::F32)?.to_vec1()).collect()
 }
 
 fn largest(map: &[f32]) -> f32 {
@@ -262,7 +274,7 @@ mod tests {
     use rcwm_models::settings::{ModelKind, ModelSettings, Preset};
 
     use super::*;
-    use crate::evaluation::Trajectory;
+    use crate::evaluation::{OTHER_KIND, Trajectory};
     use crate::model::agent::initialise;
 
     fn film(kind: ModelKind) -> Option<AttentionFilm> {
@@ -271,7 +283,8 @@ mod tests {
         let agent = Agent::new(&parameters.frozen(), &settings).unwrap();
         let mut episode = Episode::blank(12);
         episode.robot_mask = Some(ndarray::Array3::from_elem((12, 64, 64), false));
-        let trajectory = Trajectory { episode: Arc::new(episode), number: 0, start: 0 };
+        let trajectory =
+            Trajectory { episode: Arc::new(episode), number: 0, kind: OTHER_KIND, start: 0, steps: 12 };
         let task = TaskTrajectories { task: "reach".into(), length: 12, chosen: vec![trajectory] };
         AttentionFilm::of(&agent, &task, 3, Latents::Sample, 0, &Device::Cpu).unwrap()
     }
@@ -296,6 +309,24 @@ mod tests {
     #[test]
     fn a_model_without_interaction_has_no_attention() {
         assert!(film(ModelKind::Vanilla).is_none());
+    }
+
+    #[test]
+    fn colours_are_those_of_the_weight_itself_whatever_else_is_in_the_film() {
+        let mut film = film(ModelKind::Rcwm).unwrap();
+        let even = 1.0 / film.keys as f32;
+        film.maps.iter_mut().for_each(|map| map.fill(even));
+        let drawn = |film: &AttentionFilm| {
+            let mut picture = RgbImage::new(400, 400);
+            film.draw_map(&mut picture, (0, 0), &film.maps[0]);
+            picture.get_pixel(0, 0).0
+        };
+        assert_eq!(drawn(&film), colour(1.0 / BRIGHTEST_TIMES_EVEN));
+        film.maps[5][7] = 0.9; // another step's outlier
+        assert_eq!(drawn(&film), colour(1.0 / BRIGHTEST_TIMES_EVEN));
+        film.maps[0][0] = 2.0 * BRIGHTEST_TIMES_EVEN * even;
+        assert_eq!(drawn(&film), COLOUR_SCALE[5]);
+        assert!(film.summary().spread.unwrap().largest > 0.89);
     }
 
     #[test]

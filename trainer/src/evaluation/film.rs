@@ -8,7 +8,7 @@ use crate::model::world::Decoded;
 use crate::plots::{Colour, IMAGINED, INK, PAPER, PlotError, text_width, write_gif, write_png, write_text};
 
 /// How long a step of a film is shown, in hundredths of a second.
-const STEP_CS: u16 = 10;
+pub(super) const STEP_CS: u16 = 10;
 const SIDE: u32 = IMAGE_SIDE as u32;
 /// Screen pixels per pixel of a picture.
 const SCALE: u32 = 2;
@@ -138,39 +138,44 @@ impl Film {
         if t < self.context { format!("{t}: seen") } else { format!("{t}: imagined") }
     }
 
-    /// Draws a picture enlarged, framed if it was imagined.
-    pub(super) fn draw(&self, on: &mut RgbImage, (left, top): (u32, u32), picture: &[Colour], t: usize) {
-        if t >= self.context {
-            for y in 0..CELL + 2 * FRAME {
-                for x in 0..CELL + 2 * FRAME {
-                    let (x, y) = ((left + x).checked_sub(FRAME), (top + y).checked_sub(FRAME));
-                    if let (Some(x), Some(y)) = (x, y)
-                        && let Some(pixel) = on.get_pixel_mut_checked(x, y)
-                    {
-                        *pixel = Rgb(IMAGINED);
-                    }
+    /// Draws what a panel shows at a step.
+    pub(super) fn draw(&self, on: &mut RgbImage, place: (u32, u32), picture: &[Colour], t: usize) {
+        draw(on, place, picture, t >= self.context);
+    }
+}
+
+/// Draws a picture enlarged, with a frame if it was imagined.
+pub(super) fn draw(on: &mut RgbImage, (left, top): (u32, u32), picture: &[Colour], imagined: bool) {
+    if imagined {
+        for y in 0..CELL + 2 * FRAME {
+            for x in 0..CELL + 2 * FRAME {
+                let (x, y) = ((left + x).checked_sub(FRAME), (top + y).checked_sub(FRAME));
+                if let (Some(x), Some(y)) = (x, y)
+                    && let Some(pixel) = on.get_pixel_mut_checked(x, y)
+                {
+                    *pixel = Rgb(IMAGINED);
                 }
             }
         }
-        for y in 0..CELL {
-            for x in 0..CELL {
-                let pixel = picture[(y / SCALE * SIDE + x / SCALE) as usize];
-                on.put_pixel(left + x, top + y, Rgb(pixel));
-            }
+    }
+    for y in 0..CELL {
+        for x in 0..CELL {
+            let pixel = picture[(y / SCALE * SIDE + x / SCALE) as usize];
+            on.put_pixel(left + x, top + y, Rgb(pixel));
         }
     }
 }
 
-fn values(x: &Tensor, t: usize) -> candle_core::Result<Vec<f32>> {
+pub(super) fn values(x: &Tensor, t: usize) -> candle_core::Result<Vec<f32>> {
     x.get(t)?.flatten_all()?.to_dtype(DType::F32)?.to_vec1()
 }
 
 /// From the range around 0 to that from 0 to 1.
-fn lifted(values: Vec<f32>) -> Vec<f32> {
+pub(super) fn lifted(values: Vec<f32>) -> Vec<f32> {
     values.into_iter().map(|x| x + 0.5).collect()
 }
 
-fn colours(values: &[f32]) -> Vec<Colour> {
+pub(super) fn colours(values: &[f32]) -> Vec<Colour> {
     let level = |value: f32| (value.clamp(0.0, 1.0) * 255.0).round() as u8;
     values.as_chunks::<3>().0.iter().map(|pixel| pixel.map(level)).collect()
 }

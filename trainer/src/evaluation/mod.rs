@@ -1,48 +1,74 @@
 //! What a model can do (spec, section 4).
 //!
-//! Nouns: a **trajectory** is a stretch of a recorded episode with robot masks; its first steps are the **context**, which the model
-//! sees, and the rest is **imagined** with the recorded actions. A **measure** is a number a step, a **trace** all numbers of one
-//! trajectory. Every model is measured on the same trajectories.
+//! Nouns: a **trajectory** is a stretch of a recorded episode with robot masks, a **window**; its first steps are the **context**, which
+//! the model sees, and the rest is **imagined** with the recorded actions. Windows end before the task is solved and the robot moves in
+//! them, unless all are asked for. A **measure** is a number a step, a **trace** all numbers of one trajectory, a **response** what
+//! changes in the imagined pictures with other actions. Every model is measured on the same trajectories. Two sets of models are compared
+//! over **training seeds**, each of which counts once.
 //!
 //! | file | holds |
 //! | --- | --- |
 //! | `open_loop` | context, then imagination |
+//! | `recordings` | episodes with masks, and who decided in them |
+//! | `motion` | which pixels change, when the robot moves |
 //! | `trajectories` | which stretches of which episodes |
-//! | `measures` | robot dynamics error, mask overlap, reconstruction and reward error of a step |
+//! | `measures` | robot dynamics error, error on what else moves, mask overlap, reconstruction and reward error of a step |
+//! | `response` | two action sequences from one start |
+//! | `response_film` | both, as a strip and animated |
 //! | `robot_dynamics` | a model on the trajectories of a task |
 //! | `report` | means, spreads and intervals; the table and the plots |
-//! | `statistics` | bootstrap over episodes, Wilson's interval |
+//! | `table` | the same for people |
+//! | `comparison` | one model against another on the same trajectories |
+//! | `seeds` | sets of models over training seeds |
+//! | `statistics` | bootstrap over episodes and over training seeds, Wilson's interval |
 //! | `closed_loop` | success rate of the exported policy, by simulators and runtimes |
 //! | `closed_loop_in_trainer` | the same of a model that no runtime deploys |
 //! | `closed_loop_results` | that, in the file that `--json` writes |
 //! | `film` | what was imagined, as a strip and animated |
 //! | `attention` | what the environment asks of the robot while a step is imagined |
+//! | `attention_spread` | the same of many states, in numbers |
 
 mod attention;
+mod attention_spread;
 mod closed_loop;
 mod closed_loop_in_trainer;
 mod closed_loop_results;
+mod comparison;
 mod film;
 mod measures;
+mod motion;
 mod open_loop;
+mod recordings;
 mod report;
+mod response;
+mod response_film;
 mod robot_dynamics;
+mod seeds;
 mod statistics;
+mod table;
 mod trajectories;
 
 pub use attention::{Attention, AttentionFilm};
+pub use attention_spread::{AttentionMaps, AttentionSpread};
 pub use closed_loop::{
     ClosedLoopError, ClosedLoopReport, ClosedLoopSettings, Position, closed_loop, recorded_episode,
 };
 pub use closed_loop_in_trainer::{TRAINER_ENGINE, closed_loop_in_trainer};
 pub use closed_loop_results::{ClosedLoopResults, ClosedLoopResultsError};
+pub use comparison::{Comparison, Over};
 pub use film::Film;
 pub use measures::{Measure, Trace, traces};
 pub use open_loop::{filtered, imagined, joined, open_loop};
-pub use report::{Comparison, ModelReport, OpenLoopReport, Series, TaskReport};
+pub use recordings::{OTHER_KIND, Recording, Recordings};
+pub use report::{KindReport, ModelReport, OpenLoopReport, Series, Spread, TaskReport};
+pub use response::{Answer, Difference, Differences, OtherActions, Response, Share, differences};
+pub use response_film::ResponseFilm;
 pub use robot_dynamics::{Latents, Measured, OpenLoopSettings, measure};
-pub use statistics::{Bootstrap, Interval, mean_and_std, wilson};
-pub use trajectories::{TaskTrajectories, Trajectory};
+pub use seeds::{OverSeeds, SeedGroup, SeedRow, Trained};
+pub use statistics::{
+    Bootstrap, Interval, SEEDS_LEAST, interval_over_seeds, mean_and_std, mean_over_seeds, wilson,
+};
+pub use trajectories::{TaskTrajectories, Trajectory, Windows};
 
 use crate::plots::PlotError;
 use crate::replay::ReplayError;
@@ -61,6 +87,19 @@ pub enum EvaluationError {
         episodes: usize,
         /// Steps of a trajectory.
         length: usize,
+    },
+    /// Nowhere does the robot move for long enough before the task is solved.
+    #[error(
+        "{task}: none of {episodes} masked episodes has a window of {least} steps that ends before success and in which the robot moves; see \
+         or imagine fewer (--context, --imagined), collect others, or take all windows (--windows anywhere)"
+    )]
+    NoMovingWindows {
+        /// The task.
+        task: String,
+        /// Its episodes with masks.
+        episodes: usize,
+        /// Steps that a window must have at least.
+        least: usize,
     },
     /// No episode has masks.
     #[error("none of the episodes has robot masks; collect some with masks (rcwm-trainer collect --masks)")]

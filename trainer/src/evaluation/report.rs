@@ -1,12 +1,14 @@
 use std::collections::BTreeMap;
-use std::fmt::Write as _;
 
 use image::RgbImage;
 use rcwm_models::settings::ModelKind;
 use serde::{Deserialize, Serialize};
 
 use super::statistics::{Bootstrap, Interval, mean_and_std};
-use super::{Measure, Measured, OpenLoopSettings, TaskTrajectories, Trace};
+use super::{
+    Answer, AttentionSpread, Comparison, Measure, Measured, OpenLoopSettings, OverSeeds, Response,
+    TaskTrajectories, Trace,
+};
 use crate::plots::{self, Band, COLOURS, Line, Panel, PlotError, Scale};
 
 /// Pixels of one panel of a plot.
@@ -28,6 +30,30 @@ pub struct Series {
     pub step_std: Vec<Option<f64>>,
 }
 
+/// One measure over some trajectories.
+#[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
+pub struct Spread {
+    /// Mean over trajectories of their means over steps.
+    pub mean: Option<f64>,
+    /// Standard deviation over trajectories.
+    pub std: Option<f64>,
+    /// 95% bootstrap interval of the mean; episodes are drawn.
+    pub interval: Option<Interval>,
+}
+
+/// A model on a task's trajectories of one kind of script.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+pub struct KindReport {
+    /// Who decided: `expert`, `mixed`, `random`, `pushed`, or `other` where the names of the episodes' files do not say.
+    pub kind: String,
+    /// Trajectories measured on.
+    pub trajectories: usize,
+    /// Episodes they are of.
+    pub episodes: usize,
+    /// By measure, of imagined states.
+    pub imagined: BTreeMap<Measure, Spread>,
+}
+
 /// A model on a task.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 pub struct TaskReport {
@@ -41,6 +67,15 @@ pub struct TaskReport {
     pub imagined: BTreeMap<Measure, Series>,
     /// By measure, of posterior states at the same steps.
     pub posterior: BTreeMap<Measure, Series>,
+    /// The same trajectories by kind of script.
+    #[serde(default)]
+    pub kinds: Vec<KindReport>,
+    /// What other actions change in the imagined pictures.
+    #[serde(default)]
+    pub response: Option<Response>,
+    /// How the attention is spread at the imagined states; none for a model without interaction.
+    #[serde(default)]
+    pub attention: Option<AttentionSpread>,
 }
 
 /// A model on every task.
@@ -54,25 +89,12 @@ pub struct ModelReport {
     pub kind: ModelKind,
     /// Sizes it started from.
     pub preset: String,
+    /// Seed of its training.
+    pub seed: u64,
     /// Updates behind it.
     pub updates: u64,
     /// Its tasks.
     pub tasks: Vec<TaskReport>,
-}
-
-/// Two models on the same trajectories of a task.
-#[derive(Debug, Clone, PartialEq, Serialize)]
-pub struct Comparison {
-    /// The task.
-    pub task: String,
-    /// The model.
-    pub model: String,
-    /// What it is compared with.
-    pub against: String,
-    /// Its mean robot dynamics error, divided by the other's.
-    pub ratio: f64,
-    /// 95% bootstrap interval of the ratio; the same trajectories are drawn for both.
-    pub interval: Option<Interval>,
 }
 
 /// Everything that was measured.
@@ -82,10 +104,14 @@ pub struct OpenLoopReport {
     pub settings: OpenLoopSettings,
     /// What the numbers mean.
     pub measures: BTreeMap<Measure, &'static str>,
+    /// The same of the response.
+    pub answers: BTreeMap<Answer, &'static str>,
     /// The models in the order they were given.
     pub models: Vec<ModelReport>,
-    /// Every later model against the first.
+    /// Every later model against the first, over episodes.
     pub comparisons: Vec<Comparison>,
+    /// Sets of models that differ in the seed of their training only, and these against each other.
+    pub over_seeds: OverSeeds,
 }
 
 impl Series {
@@ -105,15 +131,46 @@ impl Series {
     }
 }
 
-fn drawn_mean(means: &[Option<f64>], draw: &[usize]) -> Option<f64> {
+impl Spread {
+    /// Of the trajectories at some places, which the bootstrap draws from.
+    fn of(means: &[Option<f64>], bootstrap: &Bootstrap) -> Self {
+        let found = mean_and_std(means.iter().flatten().copied());
+        Self {
+            mean: found.map(|(mean, _)| mean),
+            std: found.map(|(_, std)| std),
+            interval: bootstrap.interval(|draw| drawn_mean(means, draw)),
+        }
+    }
+}
+
+impl KindReport {
+    fn all(task: &TaskTrajectories, traces: &[Trace], seed: u64) -> Vec<Self> {
+        let numbers = task.numbers();
+        let of = |(kind, places): (&'static str, Vec<usize>)| {
+            let mut episodes: Vec<usize> = places.iter().map(|place| numbers[*place]).collect();
+            let bootstrap = Bootstrap::new(&episodes, seed);
+            let means = |measure| places.iter().map(|place| traces[*place].mean(measure)).collect::<Vec<_>>();
+            let imagined =
+                Measure::ALL.into_iter().map(|measure| (measure, Spread::of(&means(measure), &bootstrap)));
+            let (kind, trajectories, imagined) = (kind.to_owned(), places.len(), imagined.collect());
+            episodes.sort_unstable();
+            episodes.dedup();
+            Self { kind, trajectories, episodes: episodes.len(), imagined }
+        };
+        task.kinds().into_iter().map(of).collect()
+    }
+}
+
+pub(super) fn drawn_mean(means: &[Option<f64>], draw: &[usize]) -> Option<f64> {
     mean_and_std(draw.iter().filter_map(|trajectory| means[*trajectory])).map(|(mean, _)| mean)
 }
 
 impl TaskReport {
-    /// Sums a task up.
+    /// Sums a task up; `settings` are those it was measured with.
     #[must_use]
-    pub fn of(task: &TaskTrajectories, measured: &Measured, seed: u64) -> Self {
+    pub fn of(task: &TaskTrajectories, measured: &Measured, settings: &OpenLoopSettings) -> Self {
         // The same draws for every model.
+        let (seed, other) = (settings.seed, settings.other_actions);
         let bootstrap = Bootstrap::new(&task.numbers(), seed);
         let all = |traces: &[Trace]| {
             Measure::ALL.iter().map(|measure| (*measure, Series::of(traces, *measure, &bootstrap))).collect()
@@ -124,6 +181,9 @@ impl TaskReport {
             episodes: task.episodes(),
             imagined: all(&measured.imagined),
             posterior: all(&measured.posterior),
+            kinds: KindReport::all(task, &measured.imagined, seed),
+            response: other.and_then(|other| Response::of(&measured.differences, other, &bootstrap)),
+            attention: measured.attention(),
         }
     }
 }
@@ -146,80 +206,14 @@ impl TaskReport {
     }
 }
 
-impl Comparison {
-    /// A model (its name, what was measured) against another on the same trajectories, by robot dynamics error; none where
-    /// either has no error at all.
-    #[must_use]
-    pub fn of(
-        task: &TaskTrajectories,
-        (model, measured): (&str, &Measured),
-        (against, other): (&str, &Measured),
-        seed: u64,
-    ) -> Option<Self> {
-        let (ours, theirs) = (measured.robot_errors(), other.robot_errors());
-        Self::of_means(&task.task, (model, &ours), (against, &theirs), &task.numbers(), seed)
-    }
-
-    /// The same of each trajectory's mean robot dynamics error; `episodes` says which episode each trajectory is of.
-    #[must_use]
-    pub fn of_means(
-        task: &str,
-        (model, ours): (&str, &[Option<f64>]),
-        (against, theirs): (&str, &[Option<f64>]),
-        episodes: &[usize],
-        seed: u64,
-    ) -> Option<Self> {
-        let ratio = |draw: &[usize]| {
-            Some(drawn_mean(ours, draw)? / drawn_mean(theirs, draw)?).filter(|ratio| ratio.is_finite())
-        };
-        Some(Self {
-            task: task.to_owned(),
-            model: model.to_owned(),
-            against: against.to_owned(),
-            ratio: ratio(&(0..ours.len()).collect::<Vec<_>>())?,
-            interval: Bootstrap::new(episodes, seed).interval(ratio),
-        })
-    }
-}
-
 impl OpenLoopReport {
     /// A report without models yet.
     #[must_use]
     pub fn new(settings: OpenLoopSettings) -> Self {
         let measures = Measure::ALL.into_iter().map(|measure| (measure, measure.definition())).collect();
-        Self { settings, measures, models: Vec::new(), comparisons: Vec::new() }
-    }
-
-    /// The summary for people.
-    #[must_use]
-    pub fn table(&self) -> String {
-        let name_width = self.models.iter().map(|model| model.name.len()).max().unwrap_or(0).max(5);
-        let mut text = format!(
-            "{} steps of context, {} imagined; pictures in [0, 1]; means, and the 95% interval of the first\n",
-            self.settings.context, self.settings.imagined
-        );
-        let _ = writeln!(
-            text,
-            "{:18} {:name_width$} {:>27} {:>10} {:>15} {:>15} {:>10}",
-            "task", "model", "robot error x1000", "on robot", "mask IoU", "reconstruction", "reward"
-        );
-        let _ = writeln!(
-            text,
-            "{:18} {:name_width$} {:>27} {:>10} {:>15} {:>15} {:>10}",
-            "", "", "", "x1000", "imagined/seen", "x1000", "error"
-        );
-        for model in &self.models {
-            for task in &model.tasks {
-                let _ = writeln!(text, "{}", table_row(&model.name, name_width, task));
-            }
-        }
-        for comparison in &self.comparisons {
-            let Comparison { task, model, against, ratio, interval } = comparison;
-            let range = interval.map_or_else(String::new, |i| format!(" ({:.3} to {:.3})", i.low, i.high));
-            let _ =
-                writeln!(text, "{task}: robot error of {model} is {ratio:.3}{range} times that of {against}");
-        }
-        text
+        let answers = Answer::ALL.into_iter().map(|answer| (answer, answer.definition())).collect();
+        let (models, comparisons, over_seeds) = (Vec::new(), Vec::new(), OverSeeds::default());
+        Self { settings, measures, answers, models, comparisons, over_seeds }
     }
 
     /// One measure over the imagined steps: a panel a task, a line a model, with a band of one standard deviation.
@@ -234,26 +228,6 @@ impl OpenLoopReport {
         };
         plots::draw(&(0..tasks).map(panel).collect::<Vec<_>>(), COLUMNS, PANEL)
     }
-}
-
-fn table_row(model: &str, name_width: usize, task: &TaskReport) -> String {
-    let mean = |series: &Series, scale: f64, digits: usize| {
-        series.mean.map_or_else(|| "-".to_owned(), |mean| format!("{:.digits$}", mean * scale))
-    };
-    let imagined = |measure: Measure| &task.imagined[&measure];
-    let error = imagined(Measure::RobotError);
-    let range =
-        error.interval.map_or_else(String::new, |i| format!(" ({:.3} to {:.3})", i.low * 1e3, i.high * 1e3));
-    let overlap = [imagined(Measure::MaskIou), &task.posterior[&Measure::MaskIou]].map(|x| mean(x, 1.0, 3));
-    format!(
-        "{:18} {model:name_width$} {:>27} {:>10} {:>15} {:>15} {:>10}",
-        task.task,
-        mean(error, 1e3, 3) + &range,
-        mean(imagined(Measure::RobotErrorOnRobot), 1e3, 2),
-        overlap.join("/"),
-        mean(imagined(Measure::ReconstructionError), 1e3, 2),
-        mean(imagined(Measure::RewardError), 1.0, 3),
-    )
 }
 
 fn line(name: &str, colour: plots::Colour, series: &Series) -> Line {

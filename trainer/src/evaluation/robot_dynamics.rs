@@ -3,8 +3,13 @@ use std::sync::atomic::{AtomicBool, Ordering};
 use candle_core::Device;
 use serde::{Deserialize, Serialize};
 
-use super::open_loop::{filtered, imagined, joined};
-use super::{EvaluationError, Film, Measure, TaskTrajectories, Trace, traces};
+use super::attention::maps_of;
+use super::open_loop::{filtered, joined};
+use super::response::{Differences, differences};
+use super::{
+    AttentionMaps, AttentionSpread, EvaluationError, Film, Measure, OtherActions, ResponseFilm,
+    TaskTrajectories, Trace, Windows, traces,
+};
 use crate::model::agent::Agent;
 use crate::model::latent::{Sampler, State};
 
@@ -48,12 +53,26 @@ pub struct OpenLoopSettings {
     pub seed: u64,
     /// Films a task and model.
     pub films: usize,
+    /// Which stretches of episodes.
+    #[serde(default = "Windows::of_older_files")]
+    pub windows: Windows,
+    /// What is done in place of the recorded actions to see what depends on them; none in files from before it was measured.
+    pub other_actions: Option<OtherActions>,
 }
 
 impl Default for OpenLoopSettings {
-    /// The paper's (Fig. 4).
+    /// Sizes are the paper's (Fig. 4).
     fn default() -> Self {
-        Self { trajectories: 100, context: 10, imagined: 54, latents: Latents::Sample, seed: 0, films: 2 }
+        Self {
+            trajectories: 100,
+            context: 10,
+            imagined: 54,
+            latents: Latents::Sample,
+            seed: 0,
+            films: 2,
+            windows: Windows::Moving,
+            other_actions: Some(OtherActions::Still),
+        }
     }
 }
 
@@ -66,9 +85,21 @@ pub struct Measured {
     pub posterior: Vec<Trace>,
     /// Films of the first trajectories.
     pub films: Vec<Film>,
+    /// How other actions change what is imagined; empty where that is not measured.
+    pub differences: Vec<Differences>,
+    /// Films of the first trajectories by the recorded actions and by others.
+    pub response_films: Vec<ResponseFilm>,
+    /// What the environment asks of the robot at the imagined steps; empty for a model without interaction.
+    pub attention: AttentionMaps,
 }
 
 impl Measured {
+    /// How the attention is spread over queries and states; none for a model without interaction.
+    #[must_use]
+    pub fn attention(&self) -> Option<AttentionSpread> {
+        self.attention.spread()
+    }
+
     /// Mean robot dynamics error of every imagined trajectory.
     #[must_use]
     pub fn robot_errors(&self) -> Vec<Option<f64>> {
@@ -117,19 +148,48 @@ fn measure_rows(
         Latents::Sample => Sampler::numbered(settings.seed, from as u64),
         Latents::Mode => Sampler::Mode,
     };
+    let counted: Vec<usize> = task.chosen[from..to].iter().map(|trajectory| trajectory.steps).collect();
     let posteriors = filtered(world, &batch, length, &mut sampler)?;
-    // A posterior knows nothing of later images: that of the last context step starts the imagination.
-    let imagined = imagined(world, &batch, &posteriors, context, &mut sampler)?;
+    // A posterior knows nothing of later images: that of the last context step starts the imagination. Other actions get the same draws.
+    let mut again = sampler.clone();
+    let start = steps(&posteriors, context - 1, 1)?.map(|x| x.squeeze(1)?.contiguous())?;
+    let actions = batch.action.narrow(1, context, length - context)?;
+    let imagined = match world.imagine_attending(&start, &actions, &mut sampler)? {
+        Some((states, maps)) => {
+            if into.attention.is_empty() {
+                into.attention = AttentionMaps::new(maps.dim(2)?);
+            }
+            for (row, steps) in counted.iter().enumerate() {
+                into.attention.extend(maps_of(&maps, row, steps - context)?);
+            }
+            states
+        }
+        None => world.imagine(&start, &actions, &mut sampler)?,
+    };
     let decoded = world.decode(&imagined)?;
-    into.imagined.extend(traces(agent, &batch, &imagined, &decoded, context)?);
     let seen = steps(&posteriors, context, length - context)?;
-    into.posterior.extend(traces(agent, &batch, &seen, &world.decode(&seen)?, context)?);
+    for (into, states, decoded) in
+        [(&mut into.imagined, &imagined, &decoded), (&mut into.posterior, &seen, &world.decode(&seen)?)]
+    {
+        let mut traces = traces(agent, &batch, states, decoded, context)?;
+        traces.iter_mut().zip(&counted).for_each(|(trace, steps)| trace.end_after(steps - context));
+        into.extend(traces);
+    }
+    if let Some(other) = settings.other_actions {
+        let states = world.imagine(&start, &other.of(&batch, context)?, &mut again)?;
+        let others = world.decode(&states)?;
+        into.differences.extend(differences(&batch, &decoded, &others, context, &counted)?);
+        for (row, steps) in counted.iter().enumerate().take(films) {
+            let pair = (&decoded, &others);
+            into.response_films.push(ResponseFilm::of(&batch.image, pair, other, row, (context, *steps))?);
+        }
+    }
     if films > 0 {
         let whole = joined(&steps(&posteriors, 0, context)?, &imagined)?;
         let shown = whole.map(|x| x.narrow(0, 0, films)?.contiguous())?;
         let decoded = world.decode(&shown)?;
-        for row in 0..films {
-            into.films.push(Film::of(&batch.image, &decoded, row, context)?);
+        for (row, steps) in counted.iter().enumerate().take(films) {
+            into.films.push(Film::of(&batch.image.narrow(1, 0, *steps)?, &decoded, row, context)?);
         }
     }
     Ok(())

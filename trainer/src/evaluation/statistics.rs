@@ -4,6 +4,10 @@ use serde::{Deserialize, Serialize};
 
 /// How many times a bootstrap draws anew.
 const RESAMPLES: usize = 1000;
+/// The same where whole trainings are drawn, of which there are few.
+const RESAMPLES_OF_SEEDS: usize = 10_000;
+/// Training seeds from which on an interval over them says something.
+pub const SEEDS_LEAST: usize = 5;
 /// Share of the draws left out at each end: a 95% interval.
 const TAIL: f64 = 0.025;
 /// Quantile of the normal distribution behind a 95% interval.
@@ -45,6 +49,7 @@ pub fn mean_and_std(values: impl IntoIterator<Item = f64>) -> Option<(f64, f64)>
 /// trajectories drawn one by one would be too narrow.
 #[derive(Debug)]
 pub struct Bootstrap {
+    /// Empty where there are fewer than two episodes.
     draws: Vec<Vec<usize>>,
 }
 
@@ -63,18 +68,50 @@ impl Bootstrap {
             let drawn = (0..members.len()).map(|_| random.random_range(0..members.len()));
             drawn.flat_map(|episode| members[episode].iter().copied()).collect()
         };
-        Self { draws: (0..RESAMPLES).map(|_| draw()).collect() }
+        let resamples = if members.len() < 2 { 0 } else { RESAMPLES };
+        Self { draws: (0..resamples).map(|_| draw()).collect() }
     }
 
-    /// The interval of what `of` makes of drawn trajectories.
+    /// The interval of what `of` makes of drawn trajectories; none of fewer than two episodes: there is nothing to draw.
     #[must_use]
     pub fn interval(&self, of: impl Fn(&[usize]) -> Option<f64>) -> Option<Interval> {
-        let mut found: Vec<f64> = self.draws.iter().filter_map(|draw| of(draw)).collect();
-        found.sort_by(f64::total_cmp);
-        let last = found.len().checked_sub(1)?;
-        let at = |share: f64| found[(share * last as f64).round() as usize];
-        Some(Interval { low: at(TAIL), high: at(1.0 - TAIL) })
+        middle(self.draws.iter().filter_map(|draw| of(draw)).collect())
     }
+}
+
+/// The range that holds 95 of 100.
+fn middle(mut found: Vec<f64>) -> Option<Interval> {
+    found.sort_by(f64::total_cmp);
+    let last = found.len().checked_sub(1)?;
+    let at = |share: f64| found[(share * last as f64).round() as usize];
+    Some(Interval { low: at(TAIL), high: at(1.0 - TAIL) })
+}
+
+/// The 95% bootstrap interval of what `of` makes of the means of two groups of training seeds, which are drawn with replacement and
+/// independently; each value is one seed's, over all its episodes. None where both have fewer than two seeds: there is nothing to draw.
+#[must_use]
+pub fn interval_over_seeds(
+    ours: &[f64],
+    theirs: &[f64],
+    of: impl Fn(f64, f64) -> f64,
+    seed: u64,
+) -> Option<Interval> {
+    if ours.len().max(theirs.len()) < 2 || ours.is_empty() || theirs.is_empty() {
+        return None;
+    }
+    let mut random = ChaCha8Rng::seed_from_u64(seed);
+    let mut mean = |values: &[f64]| {
+        let drawn = (0..values.len()).map(|_| values[random.random_range(0..values.len())]);
+        drawn.sum::<f64>() / values.len() as f64
+    };
+    let found = (0..RESAMPLES_OF_SEEDS).map(|_| of(mean(ours), mean(theirs)));
+    middle(found.filter(|value| value.is_finite()).collect())
+}
+
+/// The 95% bootstrap interval of the mean of training seeds, each value one seed's; none of fewer than two.
+#[must_use]
+pub fn mean_over_seeds(values: &[f64], seed: u64) -> Option<Interval> {
+    if values.len() < 2 { None } else { interval_over_seeds(values, &[0.0], |mean, _| mean, seed) }
 }
 
 #[cfg(test)]
@@ -115,6 +152,29 @@ mod tests {
         let mean =
             |draw: &[usize]| mean_and_std(draw.iter().map(|i| episodes[*i] as f64)).map(|(mean, _)| mean);
         assert_eq!(bootstrap.interval(mean), Some(Interval { low: 0.0, high: 1.0 }));
+    }
+
+    #[test]
+    fn one_episode_has_no_interval_however_many_trajectories_are_of_it() {
+        let bootstrap = Bootstrap::new(&[3; 20], 1);
+        let mean = |draw: &[usize]| mean_and_std(draw.iter().map(|i| *i as f64)).map(|(mean, _)| mean);
+        assert_eq!(bootstrap.interval(mean), None);
+    }
+
+    #[test]
+    fn an_interval_over_seeds_is_as_wide_as_seeds_differ() {
+        let ratio = |ours: &[f64], theirs: &[f64]| interval_over_seeds(ours, theirs, |a, b| a / b, 0);
+        let same = ratio(&[1.0; 5], &[2.0; 5]).unwrap();
+        assert_eq!((same.low, same.high), (0.5, 0.5), "no matter how many episodes each has");
+        let found = ratio(&[0.9, 1.0, 1.1, 0.8, 1.2], &[2.0; 5]).unwrap();
+        // The standard error of the mean of five is 0.063: 1.96 of them on either side, halved by the division.
+        assert!((found.low - 0.438).abs() < 0.01 && (found.high - 0.562).abs() < 0.01, "{found:?}");
+        let both = ratio(&[0.9, 1.0, 1.1, 0.8, 1.2], &[1.8, 2.0, 2.2, 1.6, 2.4]).unwrap();
+        assert!(both.high - both.low > 1.3 * (found.high - found.low), "both groups are drawn: {both:?}");
+        assert_eq!(ratio(&[1.0], &[2.0]), None, "one seed each: nothing to draw");
+        assert!(ratio(&[1.0, 2.0], &[2.0]).is_some() && ratio(&[], &[2.0, 1.0]).is_none());
+        assert_eq!(mean_over_seeds(&[3.0], 0), None);
+        assert_eq!(mean_over_seeds(&[1.0, 2.0], 0), Some(Interval { low: 1.0, high: 2.0 }));
     }
 
     #[test]

@@ -178,27 +178,12 @@ impl Folder {
     ///
     /// # Errors
     /// See [`LoadError`].
-    pub fn load(&self, capacity: usize, seen: impl FnMut()) -> Result<Replay, LoadError> {
-        self.load_where(|_| true, capacity, seen)
-    }
-
-    /// The same of those episodes only that `keep` keeps.
-    ///
-    /// # Errors
-    /// See [`LoadError`].
-    pub fn load_where(
-        &self,
-        keep: impl Fn(&Episode) -> bool,
-        capacity: usize,
-        mut seen: impl FnMut(),
-    ) -> Result<Replay, LoadError> {
+    pub fn load(&self, capacity: usize, mut seen: impl FnMut()) -> Result<Replay, LoadError> {
         let mut replay = Replay::new(capacity);
         for read in self.episodes() {
             let (task, path, episode) = read?;
-            if keep(&episode) {
-                let refused = |source| LoadError::Refused { path: path.to_path_buf(), source };
-                replay.add(task, episode).map_err(refused)?;
-            }
+            let refused = |source| LoadError::Refused { path: path.to_path_buf(), source };
+            replay.add(task, episode).map_err(refused)?;
             seen();
         }
         Ok(replay)

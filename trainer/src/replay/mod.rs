@@ -20,4 +20,5 @@ mod store;
 pub use load::{Folder, LoadError};
 pub use prefetch::{Prefetch, PrefetchError};
 pub use shared::SharedReplay;
+pub(crate) use store::check_episode;
 pub use store::{Replay, ReplayError, Starts, append_steps};

@@ -128,7 +128,7 @@ impl Replay {
     /// See [`ReplayError`]; nothing is changed then.
     pub fn add(&mut self, task: &str, episode: impl Into<Arc<Episode>>) -> Result<(), ReplayError> {
         let episode = episode.into();
-        check(task, &episode)?;
+        check_episode(task, &episode)?;
         let steps = episode.len();
         if steps > self.capacity {
             return Err(ReplayError::TooLong { task: task.to_owned(), steps, capacity: self.capacity });
@@ -337,7 +337,11 @@ fn append_facts(episode: &Episode, from: usize, count: usize, batch: &mut HostBa
     batch.pushed.extend(episode.pushed.slice_axis(Axis(0), range));
 }
 
-fn check(task: &str, episode: &Episode) -> Result<(), ReplayError> {
+/// Refuses an episode without steps or with numbers that are not finite.
+///
+/// # Errors
+/// [`ReplayError::Empty`] or [`ReplayError::NotFinite`].
+pub(crate) fn check_episode(task: &str, episode: &Episode) -> Result<(), ReplayError> {
     if episode.is_empty() {
         return Err(ReplayError::Empty { task: task.to_owned() });
     }

@@ -6,10 +6,9 @@ use serde::{Deserialize, Serialize};
 use super::{Draft, Measurement, ReportError, shown_words};
 use crate::checkpoint::{Checkpoint, CheckpointSettings};
 use crate::evaluation::{
-    Attention, AttentionFilm, Latents, OpenLoopSettings, TaskReport, TaskTrajectories, measure,
+    Attention, AttentionFilm, Latents, OpenLoopSettings, Recordings, TaskReport, TaskTrajectories, measure,
 };
 use crate::model::agent::Agent;
-use crate::replay::Replay;
 
 /// What data are called in which nothing was disturbed.
 pub const UNDISTURBED: &str = "none";
@@ -56,6 +55,9 @@ pub struct Dynamics {
     pub episode_of: Vec<usize>,
     /// Mean robot dynamics error of each trajectory.
     pub robot_errors: Vec<Option<f64>>,
+    /// Which of the part's pictures are films of two action sequences from one start; the others are strips.
+    #[serde(default)]
+    pub response_pictures: Vec<usize>,
 }
 
 /// What the attention of a model was drawn from.
@@ -172,11 +174,17 @@ impl Subject {
         for (number, film) in measured.films.iter().enumerate() {
             film.write_strip(STRIP_EVERY, &draft.picture(&format!("strip-{number}.png")))?;
         }
+        let mut response_pictures = Vec::new();
+        for (number, film) in measured.response_films.iter().enumerate() {
+            response_pictures.push(draft.pictures());
+            film.write_gif(&draft.picture(&format!("response-{number}.gif")))?;
+        }
         Ok(Dynamics {
             checkpoint: self.settings.clone(),
-            report: TaskReport::of(task, &measured, settings.seed),
+            report: TaskReport::of(task, &measured, settings),
             episode_of: task.numbers(),
             robot_errors: measured.robot_errors(),
+            response_pictures,
         })
     }
 
@@ -192,13 +200,13 @@ impl Subject {
     /// See [`ReportError`].
     pub fn attend(
         &self,
-        replay: &Replay,
+        recordings: &Recordings,
         source: &AttentionSource,
         device: &Device,
         draft: &mut Draft,
     ) -> Result<Option<AttentionPart>, ReportError> {
         let length = source.context + ATTENTION_STEPS;
-        let Some(task) = TaskTrajectories::whole(replay, &source.task, length, source.seed) else {
+        let Some(task) = TaskTrajectories::whole(recordings, &source.task, length, source.seed) else {
             return Ok(None);
         };
         let context = source.context.min(task.length - 1);

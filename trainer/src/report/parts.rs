@@ -61,6 +61,12 @@ pub struct Draft {
 }
 
 impl Draft {
+    /// How many pictures it has.
+    #[must_use]
+    pub fn pictures(&self) -> usize {
+        self.pictures.len()
+    }
+
     /// Where to write a picture, whose name is kept with the part.
     pub fn picture(&mut self, name: &str) -> PathBuf {
         let file = format!("{}.{}.{name}", self.stem, self.digest);
