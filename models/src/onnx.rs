@@ -2,7 +2,11 @@
 //!
 //! Unknown fields are skipped on reading. Only what both the trainer (writes) and the runtime (reads, inspects) need is here.
 
+mod amounts;
+
 use prost::Message;
+
+pub use amounts::Amounts;
 
 /// `TensorProto.DataType` of the types we use.
 pub mod data_type {
@@ -271,6 +275,20 @@ pub enum OnnxError {
     /// Not a protobuf message of this form.
     #[error("not a readable ONNX file: {0}")]
     Decode(#[from] prost::DecodeError),
+    /// Its bytes do not make up messages.
+    #[error("not a readable ONNX file: {reason}")]
+    Broken {
+        /// Where it breaks off.
+        reason: &'static str,
+    },
+    /// It holds more of something than any part does.
+    #[error("the ONNX file holds {what}, more than {max} are not accepted; export with the matching trainer")]
+    TooMany {
+        /// What there is too much of, and where.
+        what: &'static str,
+        /// The limit.
+        max: usize,
+    },
     /// The file has no graph.
     #[error("the ONNX file holds no graph")]
     NoGraph,
@@ -285,11 +303,13 @@ pub enum OnnxError {
 }
 
 /// Reads an ONNX file and checks that it is self-contained: standard operators only, no external data, no control flow, no
-/// sparse weights, no local functions.
+/// sparse weights, no local functions. What it holds is counted first ([`Amounts`]): decoding a file takes little more memory than
+/// the file itself.
 ///
 /// # Errors
 /// See [`OnnxError`].
 pub fn parse_self_contained(bytes: &[u8]) -> Result<Model, OnnxError> {
+    Amounts::check(bytes)?;
     let model = Model::decode(bytes)?;
     let graph = model.graph.as_ref().ok_or(OnnxError::NoGraph)?;
     let refuse = |what: String| Err(OnnxError::NotAccepted { what });

@@ -44,12 +44,21 @@ impl Values {
     }
 }
 
+/// Longest header accepted of a file that holds few arrays, in bytes: some hundred of them.
+const FEW_HEADER_BYTES_MAX: u64 = 1 << 16;
+
 /// Why named arrays could not be read.
 #[derive(Debug, thiserror::Error)]
 pub enum TensorsError {
     /// Not a safetensors file, or a damaged one.
     #[error("not a readable safetensors file: {0}")]
     Format(#[from] safetensors::SafeTensorError),
+    /// It describes more arrays than such a file has.
+    #[error("a header of {found} bytes, at most {FEW_HEADER_BYTES_MAX} are accepted; export the file again")]
+    Header {
+        /// Length that the file states.
+        found: u64,
+    },
     /// An element type that these files do not use.
     #[error("tensor {name:?} has type {found}, expected f32, i64 or u8")]
     DType {
@@ -92,6 +101,18 @@ impl Tensors {
             tensors.insert(name.clone(), read_view(&name, &view)?);
         }
         Ok(Self(tensors))
+    }
+
+    /// The same of a file from outside that holds some tens of arrays: a longer header, which takes many times its length in memory, is
+    /// refused before it is read.
+    ///
+    /// # Errors
+    /// [`TensorsError::Header`], or as [`Self::from_bytes`].
+    pub fn of_few(bytes: &[u8]) -> Result<Self, TensorsError> {
+        match bytes.first_chunk::<8>().map(|length| u64::from_le_bytes(*length)) {
+            Some(found) if found > FEW_HEADER_BYTES_MAX => Err(TensorsError::Header { found }),
+            _ => Self::from_bytes(bytes),
+        }
     }
 
     /// Writes a safetensors file.
@@ -200,6 +221,17 @@ mod tests {
         assert_eq!(read, tensors);
         assert!(matches!(read.f32("a/z"), Err(TensorsError::Unexpected { .. })));
         assert!(matches!(read.f32("b"), Err(TensorsError::Missing { .. })));
+    }
+
+    #[test]
+    fn a_header_of_thousands_of_arrays_is_refused_before_it_is_read() {
+        let mut tensors = Tensors::default();
+        for index in 0..2000 {
+            tensors.0.insert(format!("{index}"), Values::U8(ArrayD::from_elem(IxDyn(&[0]), 0)));
+        }
+        let bytes = tensors.to_bytes().unwrap();
+        assert!(matches!(Tensors::of_few(&bytes), Err(TensorsError::Header { .. })));
+        assert_eq!(Tensors::from_bytes(&bytes).unwrap(), tensors);
     }
 
     #[test]

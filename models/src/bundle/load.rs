@@ -7,7 +7,9 @@ use prost::Message;
 
 use super::graph::{self, GraphError};
 use super::manifest::{FORMAT, FileEntry, Manifest, PartEntry, PartName, TensorSpec};
-use super::{DType, GOLDEN_BYTES_MAX, MANIFEST_BYTES_MAX, MANIFEST_FILE, PART_BYTES_MAX};
+use super::{
+    DType, GOLDEN_BYTES_MAX, MANIFEST_BYTES_MAX, MANIFEST_FILE, PART_BYTES_MAX, PARTS_BYTES_MAX,
+};
 use crate::files::{FileError, read_capped, sha256_hex};
 use crate::onnx::{self, OnnxError};
 use crate::settings::{ModelKind, SettingsError};
@@ -148,7 +150,7 @@ impl Bundle {
         let mut parts = BTreeMap::new();
         for entry in &manifest.parts {
             let bytes = read_entry(folder, &entry.file_entry(), PART_BYTES_MAX)?;
-            let model = check_graph(entry, &bytes, manifest.model.classes)?;
+            let model = check_graph(entry, bytes, manifest.model.classes)?;
             parts.insert(entry.name, model.encode_to_vec());
         }
         let initial = read_tensors(folder, &manifest.initial, INITIAL_BYTES_MAX)
@@ -221,6 +223,12 @@ impl Manifest {
                 return Err(BundleError::Part { part, problem: "missing" });
             }
         }
+        let bytes = self.parts.iter().fold(0_u64, |sum, entry| sum.saturating_add(entry.bytes));
+        if bytes > PARTS_BYTES_MAX {
+            return Err(BundleError::Invalid(format!(
+                "the parts hold {bytes} bytes together, at most {PARTS_BYTES_MAX} are accepted"
+            )));
+        }
         for (index, entry) in self.parts.iter().enumerate() {
             if self.parts[..index].iter().any(|before| before.name == entry.name) {
                 return Err(BundleError::Part { part: entry.name, problem: "listed twice" });
@@ -269,9 +277,11 @@ fn read_entry(folder: &Path, entry: &FileEntry, bytes_max: u64) -> Result<Vec<u8
     Ok(bytes)
 }
 
-fn check_graph(entry: &PartEntry, bytes: &[u8], classes: usize) -> Result<onnx::Model, BundleError> {
+fn check_graph(entry: &PartEntry, bytes: Vec<u8>, classes: usize) -> Result<onnx::Model, BundleError> {
     let part = entry.name;
-    let model = onnx::parse_self_contained(bytes).map_err(|source| BundleError::Onnx { part, source })?;
+    let model = onnx::parse_self_contained(&bytes).map_err(|source| BundleError::Onnx { part, source })?;
+    // Not kept beside what was read from it.
+    drop(bytes);
     let graph = model.graph.as_ref().ok_or(BundleError::Onnx { part, source: OnnxError::NoGraph })?;
     let specs = |values: &[onnx::ValueInfo]| -> Option<Vec<TensorSpec>> {
         values
@@ -318,7 +328,7 @@ impl DType {
 
 fn read_tensors(folder: &Path, entry: &FileEntry, bytes_max: u64) -> Result<Tensors, BundleError> {
     let bytes = read_entry(folder, entry, bytes_max)?;
-    Tensors::from_bytes(&bytes).map_err(|source| BundleError::Tensors { file: entry.file.clone(), source })
+    Tensors::of_few(&bytes).map_err(|source| BundleError::Tensors { file: entry.file.clone(), source })
 }
 
 fn read_initial(manifest: &Manifest, tensors: &Tensors) -> Result<InitialState, BundleError> {

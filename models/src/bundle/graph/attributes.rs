@@ -1,6 +1,6 @@
 //! A node's attributes: each read once, with its type, and none left over.
 
-use crate::onnx::{Attribute, Node, attribute_type};
+use crate::onnx::{Amounts, Attribute, Node, attribute_type};
 
 /// Attributes not yet read.
 pub(super) struct Attributes<'a>(Vec<&'a Attribute>);
@@ -8,6 +8,10 @@ pub(super) struct Attributes<'a>(Vec<&'a Attribute>);
 impl<'a> Attributes<'a> {
     pub(super) fn of(node: &'a Node) -> Result<Self, String> {
         let all: Vec<&Attribute> = node.attribute.iter().collect();
+        // Each is compared with those before it: there are few.
+        if all.len() > Amounts::NODE_ATTRIBUTES {
+            return Err(format!("{} attributes, at most {} are accepted", all.len(), Amounts::NODE_ATTRIBUTES));
+        }
         for (index, attribute) in all.iter().enumerate() {
             if all[..index].iter().any(|before| before.name == attribute.name) {
                 return Err(format!("attribute {:?} is there twice", attribute.name));

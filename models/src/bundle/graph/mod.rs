@@ -13,22 +13,18 @@ mod value;
 use std::collections::HashMap;
 
 use super::{DType, TensorSpec};
-use crate::onnx::{Graph, Model, Node, Tensor, ValueInfo};
+use crate::onnx::{Amounts, Graph, Model, Node, Tensor, ValueInfo};
 use attributes::Attributes;
 use value::Value;
 
 /// Operator sets whose operators mean what is checked here.
 const OPSETS: std::ops::RangeInclusive<i64> = 17..=18;
 
-/// What a part may hold at most. The paper's largest part has 65 nodes and 4 million elements between its nodes.
+/// What a part may hold at most, beside [`Amounts`]. The paper's largest part has 4 million elements between its nodes.
 struct Limits;
 
 impl Limits {
-    const NODES: usize = 1024;
-    const CONSTANTS: usize = 1024;
-    const NODE_INPUTS: usize = 16;
     const RANK: usize = 6;
-    const NAME_BYTES: usize = 256;
     /// All values between the nodes together, and what a convolution unfolds its input to: 64 MiB as f32.
     const ELEMENTS: usize = 1 << 24;
 }
@@ -90,6 +86,16 @@ pub enum GraphError {
         /// What does not fit.
         reason: String,
     },
+    /// An output that may be no class: an index out of bounds in the next part.
+    #[error("output {name:?} may hold {}, expected classes 0 to {class_max}", between(*.range))]
+    Range {
+        /// The output.
+        name: String,
+        /// Smallest and largest value that it may hold, as far as that is known.
+        range: Option<(i64, i64)>,
+        /// The largest class.
+        class_max: i64,
+    },
     /// A value is not what the file says of it.
     #[error("value {name:?} is {found}, the file says {expected}")]
     Value {
@@ -102,7 +108,12 @@ pub enum GraphError {
     },
 }
 
-/// Checks a part. `classes` is m: integers that enter are class indices, 0 to m - 1.
+fn between(range: Option<(i64, i64)>) -> String {
+    range.map_or_else(|| "any integer".into(), |(min, max)| format!("integers from {min} to {max}"))
+}
+
+/// Checks a part. `classes` is m: integers that enter are class indices, 0 to m - 1, and so are those that leave, whatever enters: they
+/// are the next part's.
 pub(super) fn check(
     model: &Model,
     inputs: &[TensorSpec],
@@ -111,11 +122,12 @@ pub(super) fn check(
 ) -> Result<(), GraphError> {
     check_opset(model)?;
     let Some(graph) = &model.graph else { return Ok(()) };
-    at_most("nodes", graph.node.len(), Limits::NODES)?;
-    at_most("constants", graph.initializer.len(), Limits::CONSTANTS)?;
+    at_most("nodes", graph.node.len(), Amounts::NODES)?;
+    at_most("constants", graph.initializer.len(), Amounts::CONSTANTS)?;
     let mut walk = Walk::default();
+    let class_max = classes.saturating_sub(1) as i64;
     for spec in inputs {
-        let range = (spec.dtype == DType::I64).then_some((0, classes.saturating_sub(1) as i64));
+        let range = (spec.dtype == DType::I64).then_some((0, class_max));
         walk.define(&spec.name, Value { range, ..Value::new(spec.dtype, spec.shape.clone()) })?;
     }
     for tensor in &graph.initializer {
@@ -127,6 +139,7 @@ pub(super) fn check(
     for spec in outputs {
         let said = Value::new(spec.dtype, spec.shape.clone());
         walk.compare(&spec.name, &said)?;
+        walk.check_range(&spec.name, class_max)?;
     }
     walk.check_claims(graph)
 }
@@ -157,7 +170,7 @@ impl Walk {
         if name.is_empty() {
             return wrong("has no name");
         }
-        at_most("bytes in a name", name.len(), Limits::NAME_BYTES)?;
+        at_most("bytes in a name", name.len(), Amounts::NAME_BYTES)?;
         if self.values.insert(name.to_owned(), value).is_some() {
             return wrong("is defined twice");
         }
@@ -170,7 +183,7 @@ impl Walk {
     }
 
     fn run(&mut self, node: &Node) -> Result<(), GraphError> {
-        at_most("inputs of a node", node.input.len(), Limits::NODE_INPUTS)?;
+        at_most("inputs of a node", node.input.len(), Amounts::NODE_INPUTS)?;
         let inputs = node.input.iter().map(|name| self.value(name)).collect::<Result<Vec<_>, _>>()?;
         let failed =
             |reason| GraphError::Node { node: node.name.clone(), operator: node.op_type.clone(), reason };
@@ -202,6 +215,16 @@ impl Walk {
         }
         let (found, expected) = (found.text(), said.text());
         Err(GraphError::Value { name: name.to_owned(), found, expected })
+    }
+
+    /// Integers that leave the part are classes.
+    fn check_range(&self, name: &str, class_max: i64) -> Result<(), GraphError> {
+        let found = self.value(name)?;
+        match (found.dtype, found.range) {
+            (DType::I64, Some((min, max))) if min >= 0 && max <= class_max => Ok(()),
+            (DType::I64, range) => Err(GraphError::Range { name: name.to_owned(), range, class_max }),
+            _ => Ok(()),
+        }
     }
 
     /// What the file says of values in between: engines read it, so it must be true.

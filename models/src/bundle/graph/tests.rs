@@ -54,6 +54,46 @@ fn an_index_that_may_leave_its_table_is_refused() {
     }
 }
 
+/// A part that adds `offset` to the classes that enter, and gives them out again.
+fn shifted_classes(offset: &[i64]) -> Result<(), GraphError> {
+    let mut model = lookup(0);
+    let graph = model.graph.as_mut().unwrap();
+    graph.node = vec![node("Add", &["z", "offset"], "out", vec![])];
+    graph.initializer = vec![Tensor::i64("offset", &[offset.len()], offset)];
+    let z = |name| TensorSpec::new(name, DType::I64, &[1, 3]);
+    check(&model, &[z("z")], &[z("out")], 4)
+}
+
+#[test]
+fn an_output_that_may_be_no_class_is_refused_whatever_the_graph_computes() {
+    shifted_classes(&[0]).unwrap();
+    for offset in [&[1][..], &[-1], &[1_000_000], &[0, 0, 1], &[1 << 62]] {
+        let error = shifted_classes(offset).unwrap_err();
+        assert!(matches!(error, GraphError::Range { class_max: 3, .. }), "{offset:?}: {error}");
+    }
+}
+
+#[test]
+fn an_output_that_jumps_only_for_some_action_is_refused_as_well() {
+    // The class is looked up in a table of offsets, by an index that depends on an input.
+    let mut model = lookup(0);
+    let graph = model.graph.as_mut().unwrap();
+    graph.node = vec![
+        node("ArgMax", &["scores"], "which", vec![int("axis", 1), int("keepdims", 1)]),
+        node("Gather", &["jumps", "which"], "jump", vec![int("axis", 0)]),
+        node("Add", &["z", "jump"], "out", vec![]),
+    ];
+    let check_jumps = |jumps: [i64; 2]| {
+        let mut model = model.clone();
+        model.graph.as_mut().unwrap().initializer = vec![Tensor::i64("jumps", &[2], &jumps)];
+        let inputs = [TensorSpec::new("z", DType::I64, &[1, 1]), TensorSpec::new("scores", DType::F32, &[1, 2])];
+        check(&model, &inputs, &[TensorSpec::new("out", DType::I64, &[1, 1])], 4)
+    };
+    check_jumps([0, 0]).unwrap();
+    let error = check_jumps([0, 1_000_000]).unwrap_err();
+    assert!(matches!(error, GraphError::Range { range: Some((0, 1_000_003)), .. }), "{error}");
+}
+
 #[test]
 fn a_constant_must_hold_what_its_shape_says() {
     let error = changed(|graph| graph.initializer[1].dims = vec![6, 3]).unwrap_err();
