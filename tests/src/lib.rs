@@ -4,6 +4,7 @@
 //! The binaries are those beside the test's own in the target folder; `make test` builds them first.
 
 pub mod faults;
+pub mod stream;
 
 use std::io::Read;
 use std::path::{Path, PathBuf};

@@ -7,9 +7,7 @@ use prost::Message;
 
 use super::graph::{self, GraphError};
 use super::manifest::{FORMAT, FileEntry, Manifest, PartEntry, PartName, TensorSpec};
-use super::{
-    DType, GOLDEN_BYTES_MAX, MANIFEST_BYTES_MAX, MANIFEST_FILE, PART_BYTES_MAX, PARTS_BYTES_MAX,
-};
+use super::{DType, GOLDEN_BYTES_MAX, MANIFEST_BYTES_MAX, MANIFEST_FILE, PART_BYTES_MAX, PARTS_BYTES_MAX};
 use crate::files::{FileError, read_capped, sha256_hex};
 use crate::onnx::{self, OnnxError};
 use crate::settings::{ModelKind, SettingsError};

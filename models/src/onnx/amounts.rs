@@ -119,10 +119,7 @@ impl Walk {
                 (Content::Message(nested), Payload::Bytes(payload)) => (1, Some((*nested, payload))),
                 (Content::Name, Payload::Bytes(name)) => {
                     if name.len() > Amounts::NAME_BYTES {
-                        return Err(OnnxError::TooMany {
-                            what: "bytes in a name",
-                            max: Amounts::NAME_BYTES,
-                        });
+                        return Err(OnnxError::TooMany { what: "bytes in a name", max: Amounts::NAME_BYTES });
                     }
                     (1, None)
                 }
@@ -187,7 +184,8 @@ fn take<'a>(bytes: &mut &'a [u8], len: u64) -> Result<&'a [u8], OnnxError> {
 fn varint(bytes: &mut &[u8]) -> Result<u64, OnnxError> {
     let mut value = 0_u64;
     for shift in (0..70).step_by(7) {
-        let (byte, rest) = bytes.split_first().ok_or(OnnxError::Broken { reason: "it ends within a field" })?;
+        let (byte, rest) =
+            bytes.split_first().ok_or(OnnxError::Broken { reason: "it ends within a field" })?;
         *bytes = rest;
         // Bits beyond the 64th are dropped, as every reader of the format does.
         value |= u64::from(byte & 0x7f).checked_shl(shift).unwrap_or(0);
@@ -202,7 +200,9 @@ fn varint(bytes: &mut &[u8]) -> Result<u64, OnnxError> {
 mod tests {
     use prost::Message as _;
 
-    use super::super::{Attribute, Dim, Graph, Model, Node, OperatorSet, Shape, Tensor, ValueInfo, data_type};
+    use super::super::{
+        Attribute, Dim, Graph, Model, Node, OperatorSet, Shape, Tensor, ValueInfo, data_type,
+    };
     use super::*;
 
     fn refused(graph: Graph) -> &'static str {
@@ -226,7 +226,10 @@ mod tests {
             input: vec!["x".into(); Amounts::NODE_INPUTS],
             output: vec!["y".into()],
             name: "n".repeat(Amounts::NAME_BYTES),
-            attribute: vec![Attribute { ints: vec![-1; 64], ..Attribute::default() }; Amounts::NODE_ATTRIBUTES],
+            attribute: vec![
+                Attribute { ints: vec![-1; 64], ..Attribute::default() };
+                Amounts::NODE_ATTRIBUTES
+            ],
             ..Node::default()
         };
         let graph = Graph {
@@ -236,7 +239,8 @@ mod tests {
             ..Graph::default()
         };
         let opset_import = vec![OperatorSet { domain: "ai.onnx".into(), version: 17 }];
-        Amounts::check(&Model { graph: Some(graph), opset_import, ..Model::default() }.encode_to_vec()).unwrap();
+        Amounts::check(&Model { graph: Some(graph), opset_import, ..Model::default() }.encode_to_vec())
+            .unwrap();
     }
 
     #[test]
@@ -252,7 +256,10 @@ mod tests {
         let input = vec![String::new(); Amounts::NODE_INPUTS + 1];
         assert_eq!(refused(with_node(Node { input, ..Node::default() })), "inputs of a node");
         let ints = vec![0; 65];
-        assert_eq!(refused(with_attribute(Attribute { ints, ..Attribute::default() })), "integers of an attribute");
+        assert_eq!(
+            refused(with_attribute(Attribute { ints, ..Attribute::default() })),
+            "integers of an attribute"
+        );
         let name = "n".repeat(Amounts::NAME_BYTES + 1);
         assert_eq!(refused(with_node(Node { op_type: name, ..Node::default() })), "bytes in a name");
         let mut info = ValueInfo::tensor("x", data_type::FLOAT, &[]);
@@ -288,7 +295,11 @@ mod tests {
         for len in 1..bytes.len() {
             assert!(Amounts::check(&bytes[..len]).is_err(), "{len}");
         }
-        for bad in [&[0xff; 11][..], &[3 << 3 | 3], &[7 << 3 | 2, 0xff, 0xff, 0xff, 0xff, 0xff, 0xff, 0xff, 0xff, 0x7f]] {
+        for bad in [
+            &[0xff; 11][..],
+            &[3 << 3 | 3],
+            &[7 << 3 | 2, 0xff, 0xff, 0xff, 0xff, 0xff, 0xff, 0xff, 0xff, 0x7f],
+        ] {
             assert!(matches!(Amounts::check(bad), Err(OnnxError::Broken { .. })), "{bad:?}");
         }
     }

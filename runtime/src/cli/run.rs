@@ -6,6 +6,7 @@ use std::time::Duration;
 
 use anyhow::Context;
 use clap::Args;
+use rcwm_models::bundle::Bundle;
 use rcwm_models::wire::LinkSettings;
 
 use super::observers::{ObserverArguments, Observers, note};
@@ -89,10 +90,10 @@ pub(super) fn run(arguments: &RunArguments) -> anyhow::Result<()> {
     };
     let mut observers = Observers::start(&arguments.observers, &bundle, &policy, log)?;
     let mut controller = Controller::open(policy, settings)?;
-    // A recorder draws with the decoder of the bundle it was started with.
-    if !arguments.observers.records() {
-        let (link, rate_hz) = (LinkSettings::new(&arguments.instance), bundle.manifest.control.rate_hz);
-        controller.take_swaps(Swapper::start(SwapSettings { link, engine, sampling, rate_hz })?);
+    match arguments.swapper(&bundle, engine, sampling) {
+        Ok(swapper) => controller.take_swaps(swapper),
+        // A run without swaps is better than none.
+        Err(reason) => eprintln!("warning: this run takes no swaps: {reason}"),
     }
     let mut status = StatusLine::start(&arguments.instance).context("starting the status line")?;
     // Asked for last: the other threads stay ordinary ones.
@@ -128,6 +129,21 @@ pub(super) fn run(arguments: &RunArguments) -> anyhow::Result<()> {
 }
 
 impl RunArguments {
+    fn swapper(
+        &self,
+        bundle: &Bundle,
+        engine: EngineSettings,
+        sampling: Sampling,
+    ) -> Result<Swapper, String> {
+        if self.observers.records() {
+            return Err(
+                "with --record, films are drawn by the decoder of the bundle it was started with".into()
+            );
+        }
+        let (link, rate_hz) = (LinkSettings::new(&self.instance), bundle.manifest.control.rate_hz);
+        Swapper::start(SwapSettings { link, engine, sampling, rate_hz }).map_err(|error| error.to_string())
+    }
+
     fn controller_settings(&self) -> ControllerSettings {
         ControllerSettings {
             episodes_max: self.episodes,

@@ -21,7 +21,7 @@ pub(super) struct StatusLine {
     thread: Option<JoinHandle<()>>,
     last: Instant,
     last_observations: u64,
-    reported: usize,
+    reported: u64,
 }
 
 impl StatusLine {
@@ -57,8 +57,8 @@ impl StatusLine {
             running.steps,
             running.return_sum,
             if running.success { " success" } else { "" },
-            tick.episodes.iter().filter(|episode| episode.whole).count(),
-            tick.episodes.iter().filter(|episode| episode.whole && episode.success).count(),
+            tick.episodes.whole(),
+            tick.episodes.successes(),
             latency.p50_us,
             latency.p99_us,
         )
@@ -67,10 +67,10 @@ impl StatusLine {
 
 impl TickObserver for StatusLine {
     fn ticked(&mut self, tick: &Tick<'_>) {
-        for episode in &tick.episodes[self.reported..] {
+        for episode in tick.episodes.since(self.reported) {
             self.send(Message::Line(episode.line()));
         }
-        self.reported = tick.episodes.len();
+        self.reported = tick.episodes.ended();
         if self.last.elapsed() >= UPDATE {
             let status = self.status(tick);
             self.send(Message::Status(status));

@@ -6,6 +6,7 @@ use clap::Args;
 use serde::Serialize;
 
 use super::EngineChoice;
+use crate::engine::EngineSettings;
 use crate::verify::{EngineReport, HalfReport, half_weights, verify, work_units};
 
 /// Arguments of `verify`.
@@ -47,7 +48,9 @@ pub(super) fn run(arguments: &VerifyArguments) -> anyhow::Result<()> {
     let bar = super::progress_bar(work_units(&bundle)? * kinds.len(), "verifying");
     let mut engines = Vec::new();
     for kind in kinds {
-        engines.push(verify(&bundle, kind, arguments.tolerance, &mut || bar.inc(1))?);
+        // As a run deploys it.
+        let deployed = EngineSettings::chosen(kind, None, false)?;
+        engines.push(verify(&bundle, deployed, arguments.tolerance, &mut || bar.inc(1))?);
     }
     bar.finish_and_clear();
     for engine in &engines {

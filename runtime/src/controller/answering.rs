@@ -124,10 +124,9 @@ impl Controller {
 
     /// Goes back to before a tick was imagined whose observation came after all.
     fn rewind(&mut self, sequence: u64, is_first: bool) -> bool {
-        let before = self.imagined.iter().find(|(imagined, _)| *imagined >= sequence);
-        let rewound = match before {
+        let rewound = match self.imagined.before(sequence) {
             // A state that the policy has given fits it.
-            Some((_, state)) if !is_first => self.policy.set_state(state).is_ok(),
+            Some(state) if !is_first => self.policy.set_state(state).is_ok(),
             _ => false,
         };
         self.imagined.clear();
@@ -256,13 +255,11 @@ impl Controller {
             // It has seen nothing that it could go on from.
             return Ok((None, (ActionSource::Fallback, self.settings.fallback.action(self.gate.last()))));
         }
-        let before = self.policy.state().clone();
+        self.imagined.note(sequence, self.policy.state());
         match self.policy.imagine(&self.gate.last().unwrap_or_default()) {
-            Ok(decision) => {
-                self.imagined.push((sequence, before));
-                Ok((Some(decision), (ActionSource::Imagined, decision.action)))
-            }
+            Ok(decision) => Ok((Some(decision), (ActionSource::Imagined, decision.action))),
             Err(error) => {
+                self.imagined.take_back();
                 let cause = self.count_failure(&error);
                 Ok((None, self.respond(Event::Unfit(cause), None)?))
             }
@@ -373,6 +370,6 @@ impl Controller {
 
     /// Puts aside an episode whose last observation will not come.
     pub(super) fn cut_episode(&mut self) {
-        self.episodes.extend(self.running.take());
+        self.running.take().into_iter().for_each(|running| self.episodes.push(running));
     }
 }

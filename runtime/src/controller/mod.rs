@@ -14,7 +14,9 @@
 
 mod answering;
 mod ended;
+mod episodes;
 mod gate;
+mod imagined;
 mod machine;
 mod report;
 mod sequence;
@@ -23,6 +25,7 @@ mod tick;
 mod times;
 
 pub use ended::{ControllerError, Ended};
+pub use episodes::{EPISODES_KEPT, Episodes};
 pub use gate::{Fallback, Gate, Passed};
 pub use machine::{Cause, Event, Response, State, TickLimits, step};
 pub use report::{Counters, EpisodeResult, Pace, RunReport};
@@ -36,9 +39,10 @@ use std::time::{Duration, Instant};
 use rcwm_models::wire::{Action, ControllerLink, LinkSettings, ObservationSample, Wait, clock::monotonic_ns};
 
 use crate::pacing::{Pacing, PacingSettings, Plan};
-use crate::policy::{self, Policy};
+use crate::policy::Policy;
 use crate::swap::{Moment, Swapper};
 use crate::telemetry::{Stage, Telemetry};
+use imagined::Imagined;
 use surprise::SurpriseTelemetry;
 
 /// Longest wait before signals are looked at.
@@ -102,7 +106,7 @@ pub struct Controller {
     telemetry: Telemetry,
     surprise: SurpriseTelemetry,
     counters: Counters,
-    episodes: Vec<EpisodeResult>,
+    episodes: Episodes,
     running: Option<EpisodeResult>,
     whole_episodes: u64,
     pace: Option<Pace>,
@@ -110,8 +114,7 @@ pub struct Controller {
     answer: Option<Action>,
     /// The answer to the last observation.
     own_answer: Option<Action>,
-    /// The policy's state before each imagined tick since the last observation, with the tick's sequence.
-    imagined: Vec<(u64, policy::State)>,
+    imagined: Imagined,
     /// A newer observation that was found while the last was worked on.
     newer: Option<ObservationSample>,
     /// An overdue tick was given its last chance.
@@ -156,13 +159,13 @@ impl Controller {
             telemetry: Telemetry::new(),
             surprise: SurpriseTelemetry::new(),
             counters: Counters::default(),
-            episodes: Vec::new(),
+            episodes: Episodes::new(),
             running: None,
             whole_episodes: 0,
             pace: None,
             answer: None,
             own_answer: None,
-            imagined: Vec::with_capacity(settings.ticks.imagined_ticks_max.min(64) as usize),
+            imagined: Imagined::new(settings.ticks.imagined_ticks_max, policy.state()),
             newer: None,
             looked: false,
             policy,
@@ -328,7 +331,7 @@ impl Controller {
     #[must_use]
     pub fn report(&self, engine: crate::EngineKind, ended: Ended) -> RunReport {
         let mut episodes = self.episodes.clone();
-        episodes.extend(self.running);
+        self.running.into_iter().for_each(|running| episodes.push(running));
         let instance = self.settings.link.instance.clone();
         let report = RunReport::new(
             self.policy.manifest(),
@@ -337,7 +340,7 @@ impl Controller {
             self.pace,
             ended,
             &self.counters,
-            episodes,
+            &episodes,
         );
         RunReport {
             latency: self.telemetry.latencies(),

@@ -6,7 +6,7 @@ use rcwm_models::bundle::Manifest;
 use rcwm_models::tasks::task_name;
 use rcwm_models::wire::{Observation, ObservationFlags};
 
-use super::{Arrival, Ended, State, SurpriseReport};
+use super::{Arrival, Ended, Episodes, State, SurpriseReport};
 use crate::EngineKind;
 use crate::realtime::Granted;
 use crate::telemetry::{Latency, table};
@@ -167,9 +167,9 @@ pub struct RunReport {
     /// Why the run ended.
     pub ended: Ended,
     /// Episodes seen from first to last.
-    pub whole_episodes: usize,
+    pub whole_episodes: u64,
     /// Those of them that were successful.
-    pub successes: usize,
+    pub successes: u64,
     /// Mean return of the whole episodes.
     pub return_mean: Option<f64>,
     /// What the controller was up to in the end.
@@ -184,8 +184,10 @@ pub struct RunReport {
     pub frames_dropped: u64,
     /// Percentiles per stage.
     pub latency: Vec<Latency>,
-    /// Every episode, cut ones included.
+    /// The last episodes, cut ones included, at most [`super::EPISODES_KEPT`].
     pub episodes: Vec<EpisodeResult>,
+    /// Episodes before them.
+    pub earlier_episodes: u64,
 }
 
 impl RunReport {
@@ -196,10 +198,9 @@ impl RunReport {
         pace: Option<Pace>,
         ended: Ended,
         counters: &Counters,
-        episodes: Vec<EpisodeResult>,
+        episodes: &Episodes,
     ) -> Self {
-        let whole: Vec<_> = episodes.iter().filter(|episode| episode.whole).collect();
-        let sum: f64 = whole.iter().map(|episode| episode.return_sum).sum();
+        let last: Vec<_> = episodes.since(0).copied().collect();
         Self {
             bundle_task: manifest.task.clone(),
             preset: manifest.provenance.preset.clone(),
@@ -207,16 +208,17 @@ impl RunReport {
             instance,
             pace,
             ended,
-            whole_episodes: whole.len(),
-            successes: whole.iter().filter(|episode| episode.success).count(),
-            return_mean: (!whole.is_empty()).then(|| sum / whole.len() as f64),
+            whole_episodes: episodes.whole(),
+            successes: episodes.successes(),
+            return_mean: episodes.return_mean(),
             last_state: State::Waiting,
             counters: *counters,
             surprise: None,
             realtime: None,
             frames_dropped: 0,
             latency: Vec::new(),
-            episodes,
+            earlier_episodes: episodes.ended() - last.len() as u64,
+            episodes: last,
         }
     }
 
@@ -234,7 +236,8 @@ impl RunReport {
     }
 
     fn episode_lines(&self) -> String {
-        let cut = self.episodes.len() - self.whole_episodes;
+        let all = self.earlier_episodes + self.episodes.len() as u64;
+        let cut = all - self.whole_episodes;
         let mut text = format!("episodes   {} whole", self.whole_episodes);
         if cut > 0 {
             text += &format!(", {cut} cut");
@@ -248,8 +251,8 @@ impl RunReport {
         for episode in self.episodes.iter().take(SHOWN_MAX) {
             text += &format!("  {}\n", episode.line());
         }
-        if self.episodes.len() > SHOWN_MAX {
-            text += &format!("  ... {} more (see --json)\n", self.episodes.len() - SHOWN_MAX);
+        if all > SHOWN_MAX as u64 {
+            text += &format!("  ... {} more (see --json, which has the last ones)\n", all - SHOWN_MAX as u64);
         }
         text
     }

@@ -2,7 +2,7 @@
 
 use rcwm_models::wire::{Action, Observation};
 
-use super::{Counters, EpisodeResult, State};
+use super::{Counters, EpisodeResult, Episodes, State};
 use crate::policy::{Decision, Policy};
 use crate::telemetry::Telemetry;
 
@@ -44,7 +44,7 @@ pub struct Tick<'a> {
     /// All so far.
     pub counters: &'a Counters,
     /// Whole and cut episodes so far.
-    pub episodes: &'a [EpisodeResult],
+    pub episodes: &'a Episodes,
     /// The running episode, this observation included.
     pub running: EpisodeResult,
 }

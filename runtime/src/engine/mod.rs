@@ -128,6 +128,12 @@ impl EngineSettings {
         }
     }
 
+    /// Whether the weights of layers are kept in 16 bits.
+    #[must_use]
+    pub const fn has_half_weights(self) -> bool {
+        matches!(self.form, Form::Compiled(Optimizations { half_weights: true, .. }))
+    }
+
     /// With another form.
     #[must_use]
     pub const fn with_form(self, form: Form) -> Self {
@@ -175,8 +181,8 @@ pub enum EngineError {
     },
     /// A weight that no training gives.
     #[error(
-        "{part}: weight {tensor:?} holds {found}, accepted are finite values up to 1e6; the bundle is damaged or its \
-         training has diverged: export another checkpoint"
+        "{part}: weight {tensor:?} holds {found}, accepted are finite values up to 1e6, with 16-bit weights up to 65504; the bundle \
+         is damaged or its training has diverged: export another checkpoint"
     )]
     Weights {
         /// The part.
@@ -285,7 +291,7 @@ struct Source<'a> {
 /// [`EngineError::NoPart`], [`EngineError::Weights`], [`EngineError::Load`], or what is wrong with ONNX Runtime's library.
 pub fn load(bundle: &Bundle, part: PartName, settings: EngineSettings) -> Result<Box<dyn Part>, EngineError> {
     let bytes = bundle.part(part).ok_or(EngineError::NoPart { part })?;
-    weights::check(part, bytes)?;
+    weights::check(part, bytes, weights::WEIGHT_MAX)?;
     let (inputs, outputs) = part.signature(&bundle.manifest.model);
     let source = Source { part, bytes, inputs, outputs };
     match settings.kind {

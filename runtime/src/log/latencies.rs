@@ -72,7 +72,7 @@ impl LoggedLatencies {
 
     fn add(&mut self, record: &TickRecord) {
         self.report.ticks += 1;
-        self.report.ticks_dropped += record.dropped_before;
+        self.report.ticks_dropped = self.report.ticks_dropped.saturating_add(record.dropped_before);
         for call in &record.calls {
             match &call.outcome {
                 LoggedOutcome::Decided { stage_ns, .. } => self.telemetry.record_policy(stage_ns),

@@ -1,7 +1,8 @@
 //! Reading a log, up to its end or its first damage.
 
-use std::fs::File;
+use std::fs::{File, OpenOptions};
 use std::io::{BufReader, Read};
+use std::os::unix::fs::OpenOptionsExt;
 use std::path::{Path, PathBuf};
 
 use rcwm_models::wire::Observation;
@@ -51,21 +52,29 @@ impl LogReader {
     pub fn open(path: &Path) -> Result<Self, LogError> {
         let io = |source| LogError::Io { path: path.to_path_buf(), source };
         let no_log = |reason: String| LogError::NotALog { path: path.to_path_buf(), reason };
-        let file = File::open(path).map_err(io)?;
-        let bytes = file.metadata().map_err(io)?.len();
+        // A pipe that nobody writes to is not waited for.
+        let file = OpenOptions::new().read(true).custom_flags(libc::O_NONBLOCK).open(path).map_err(io)?;
+        let meta = file.metadata().map_err(io)?;
+        if !meta.is_file() {
+            return Err(no_log("it is a folder, a pipe or a device".into()));
+        }
+        let bytes = meta.len();
         let mut file = BufReader::with_capacity(1 << 16, file);
         let version = read_start(&mut file).map_err(io)?.map_err(no_log)?;
         if version != VERSION {
             return Err(LogError::Version { path: path.to_path_buf(), found: version, expected: VERSION });
         }
         let mut frames = FrameReader::new(file, MAGIC.len() as u64 + 4);
-        let header = match frames.next().map_err(io)? {
+        let header: Header = match frames.next().map_err(io)? {
             Next::Payload(payload) => {
                 serde_json::from_slice(payload).map_err(|error| no_log(error.to_string()))?
             }
             Next::End => return Err(no_log("it ends before its header".into())),
             Next::Damaged(reason) => return Err(no_log(format!("its header is damaged: {reason}"))),
         };
+        if let Some(unfit) = header.unfit() {
+            return Err(no_log(format!("its header tells of {unfit}")));
+        }
         let path = path.to_path_buf();
         let images = ImagePacker::new();
         Ok(Self { path, header, frames, images, ticks: 0, bytes, finished: false, over: false })

@@ -16,6 +16,8 @@ use crate::policy::{BranchState, CallKind, Sampling, State, Surprise};
 pub(super) const VERSION: u32 = 1;
 /// One record of so many holds the whole state and a whole picture.
 pub const KEYFRAME_TICKS: u64 = 256;
+/// Most threads that a run may have.
+const THREADS_MAX: usize = 64;
 /// Bytes of a state's digest.
 pub(super) const DIGEST_BYTES: usize = 16;
 
@@ -42,6 +44,20 @@ pub struct Header {
     pub stages: Vec<String>,
     /// The machine: other processors may round otherwise.
     pub machine: Machine,
+}
+
+impl Header {
+    /// What in it no run could have written; a checksum only says that nothing was changed since.
+    pub(super) fn unfit(&self) -> Option<String> {
+        if !(1..=THREADS_MAX).contains(&self.engine.threads) {
+            return Some(format!(
+                "an engine with {} threads, expected 1 to {THREADS_MAX}",
+                self.engine.threads
+            ));
+        }
+        let rate_max = self.rate_max.filter(|rate_max| !rate_max.is_finite() || *rate_max < 0.0);
+        rate_max.map(|rate_max| format!("a rate limit of {rate_max}"))
+    }
 }
 
 /// The machine a log was written on.
@@ -102,7 +118,7 @@ impl BundleIdentity {
         };
         let differing = names.into_iter().find(|name| of(self, name) != of(other, name));
         let short = |sha256: Option<String>| {
-            sha256.map_or("missing".into(), |sha256| sha256[..12.min(sha256.len())].to_owned())
+            sha256.map_or("missing".into(), |sha256| sha256.chars().take(12).collect::<String>())
         };
         match differing {
             Some(name) => {

@@ -119,7 +119,7 @@ impl Replayer {
     fn tick(&mut self, tick: &LoggedTick) {
         let record = &tick.record;
         self.report.ticks += 1;
-        self.report.ticks_dropped += record.dropped_before;
+        self.report.ticks_dropped = self.report.ticks_dropped.saturating_add(record.dropped_before);
         self.report.answers.count(record.answer.source);
         if record.resumes {
             self.resume(tick);
@@ -287,7 +287,8 @@ impl Replayer {
     }
 
     fn sent(&mut self, record: &TickRecord) {
-        if !record.overtaken {
+        // What is not finite was not sent, whatever the log says: it shows as a difference.
+        if !record.overtaken && record.answer.action.iter().all(|x| x.is_finite()) {
             self.gate.sent(record.answer.action);
             self.last_sent_known = true;
         }

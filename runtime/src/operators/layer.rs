@@ -98,10 +98,8 @@ impl Layer {
                 Part::Product(matrix) => matrix.add_product(arch, slice(next()?)?, columns.clone(), out),
                 Part::Rows { offsets, table } => {
                     let z = slice::<i64>(next()?)?;
-                    let rows = z
-                        .iter()
-                        .zip(offsets)
-                        .map(|(z, offset)| usize::try_from(z + offset).unwrap_or(usize::MAX));
+                    let row = |z: &i64, offset: &i64| usize::try_from(z.checked_add(*offset)?).ok();
+                    let rows = z.iter().zip(offsets).map(|(z, offset)| row(z, offset).unwrap_or(usize::MAX));
                     if rows.clone().any(|row| row >= table.rows()) {
                         bail!("a class that does not exist among {z:?}");
                     }

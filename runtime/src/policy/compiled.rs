@@ -48,8 +48,10 @@ impl Compiled {
         optimizations: Optimizations,
         threads: usize,
     ) -> Result<Self, PolicyError> {
+        let weight_max =
+            if optimizations.half_weights { weights::HALF_WEIGHT_MAX } else { weights::WEIGHT_MAX };
         for part in PartName::REQUIRED {
-            weights::check(part, bundle.part(part).ok_or(EngineError::NoPart { part })?)?;
+            weights::check(part, bundle.part(part).ok_or(EngineError::NoPart { part })?, weight_max)?;
         }
         let team = match threads {
             0 | 1 => None,

@@ -331,10 +331,15 @@ impl Policy {
     /// Carries on from another state.
     ///
     /// # Errors
-    /// [`PolicyError::Observation`] when its sizes are not the model's.
+    /// [`PolicyError::Observation`] when its sizes are not the model's, or it holds a class that does not exist or a number that is not
+    /// finite: what is carried on enters the parts as it is.
     pub fn set_state(&mut self, state: &State) -> Result<(), PolicyError> {
         if !state.same_sizes(&self.initial) {
             return Err(PolicyError::Observation("the state is of another model's size".into()));
+        }
+        if !state.is_of_classes(self.manifest.model.classes) {
+            let what = "the state holds a class that does not exist, or a number that is not finite";
+            return Err(PolicyError::Observation(what.into()));
         }
         self.state.clone_from(state);
         self.ahead = None;

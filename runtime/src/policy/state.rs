@@ -77,6 +77,15 @@ impl State {
         }
     }
 
+    /// Whether every z is one of this many classes, and every h finite.
+    pub(super) fn is_of_classes(&self, classes: usize) -> bool {
+        let exists = |class: &i64| usize::try_from(*class).is_ok_and(|class| class < classes);
+        let is_sound = |branch: &BranchState| {
+            branch.z.iter().all(exists) && branch.h.iter().all(|value| value.is_finite())
+        };
+        is_sound(&self.robot) && is_sound(&self.environment)
+    }
+
     pub(super) fn same_sizes(&self, other: &Self) -> bool {
         let sizes =
             |s: &Self| [s.robot.z.len(), s.robot.h.len(), s.environment.z.len(), s.environment.h.len()];

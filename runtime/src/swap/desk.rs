@@ -1,7 +1,6 @@
 //! The desk's thread: hears requests one after another, prepares, hands over, and says what happened.
 
 use std::io::{self, Read};
-use std::os::fd::AsRawFd;
 use std::os::unix::net::{UnixListener, UnixStream};
 use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, Ordering};
@@ -77,21 +76,26 @@ impl Desk {
         };
         message::say(stream, &Answer::Loading)?;
         let start = Instant::now();
-        match self.prepare(&request) {
+        match self.prepare(&request, &|| !self.stopped() && !has_left(stream)) {
             Ok(policy) => {
                 message::say(stream, &Answer::Ready { prepared_s: start.elapsed().as_secs_f64() })?;
-                self.hand_over(stream, policy, &request)
+                // Who has left before hearing this may rely on it that the bundle is not laid out.
+                match has_left(stream) {
+                    true => message::say(stream, &Answer::Withdrawn),
+                    false => self.hand_over(stream, policy, &request),
+                }
             }
+            Err(SwapError::Unwanted) => message::say(stream, &Answer::Withdrawn),
             Err(error) => refuse(one_line(&error)),
         }
     }
 
-    fn prepare(&self, request: &Request) -> Result<Policy, SwapError> {
+    fn prepare(&self, request: &Request, wanted: &dyn Fn() -> bool) -> Result<Policy, SwapError> {
         let before = priority::threads().map_err(SwapError::Helpers)?;
-        let policy = prepare::prepare(&request.bundle, &self.settings)?;
+        let policy = prepare::prepare(&request.bundle, &self.settings, wanted)?;
         // What the run itself has started meanwhile is among them: it gets what it would have inherited.
         let helpers = &priority::threads().map_err(SwapError::Helpers)? - &before;
-        while !helpers.is_empty() && !self.stopped() {
+        while !helpers.is_empty() && wanted() {
             if let Some(ticking) = self.handover.ticking() {
                 let given = helpers.iter().try_for_each(|to| match priority::give(ticking, *to) {
                     // It has ended since.
@@ -112,7 +116,6 @@ impl Desk {
         let task = policy.manifest().task.clone();
         let start = Instant::now();
         self.handover.put(policy, request.when);
-        stream.set_nonblocking(true)?;
         let (old, answer) = loop {
             let left = has_left(stream);
             if let Some(old) = self.handover.old() {
@@ -134,7 +137,6 @@ impl Desk {
         }
         let (preset, updates) = (provenance.preset, provenance.updates);
         let answer = answer.unwrap_or(Answer::Taken { task, preset, updates, waited_s });
-        stream.set_nonblocking(false)?;
         message::say(stream, &answer)
     }
 }
@@ -151,25 +153,18 @@ pub(super) fn sweep(policies: &Receiver<Policy>, handover: &Handover) {
     }
 }
 
-/// Whether the one who asks has closed its end.
+/// Whether the one who asks has closed its end; never waits.
 fn has_left(mut stream: &UnixStream) -> bool {
-    match stream.read(&mut [0; 64]) {
+    let looked = stream.set_nonblocking(true).and_then(|()| stream.read(&mut [0; 64]));
+    let left = match looked {
         Ok(len) => len == 0,
         Err(error) => !message::is_timeout(&error),
-    }
+    };
+    left || stream.set_nonblocking(false).is_err()
 }
 
 /// The run's own user and root.
 fn may_ask(stream: &UnixStream) -> io::Result<bool> {
-    let mut peer = libc::ucred { pid: 0, uid: 0, gid: 0 };
-    let mut len = size_of::<libc::ucred>() as libc::socklen_t;
-    let (place, len_place) = ((&raw mut peer).cast(), &raw mut len);
-    // SAFETY: the socket is open during the call, and the place is as long as `len` says.
-    let result = unsafe {
-        libc::getsockopt(stream.as_raw_fd(), libc::SOL_SOCKET, libc::SO_PEERCRED, place, len_place)
-    };
-    if result != 0 {
-        return Err(io::Error::last_os_error());
-    }
-    Ok(peer.uid == 0 || peer.uid == rustix::process::geteuid().as_raw())
+    let uid = message::user_of_peer(stream)?;
+    Ok(uid == 0 || uid == rustix::process::geteuid().as_raw())
 }

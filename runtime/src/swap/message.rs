@@ -1,10 +1,12 @@
 //! What is said between the one who asks and the desk: one request and some answers, each a line of JSON, over a Unix socket.
 //!
 //! The socket has a name but no file (Linux, abstract): nothing is left behind by a run that is killed, and its name is free at once.
-//! The desk serves its own user and root only. Containers meet where they share the network namespace.
+//! A name belongs to whoever takes it first, so that each end looks who the other is: the desk serves its own user and root only, and who
+//! asks talks to a desk of their own user or root's only (root to any). Containers meet where they share the network namespace.
 
 use std::io::{self, BufRead, BufReader, Read, Write};
 use std::net::Shutdown;
+use std::os::fd::AsRawFd;
 use std::os::linux::net::SocketAddrExt;
 use std::os::unix::net::{SocketAddr, UnixStream};
 use std::path::{Path, PathBuf};
@@ -22,6 +24,10 @@ pub(super) const VERSION: u32 = 1;
 const LINE_BYTES_MAX: u64 = 64 << 10;
 /// How often the one who asks looks at its stop flag.
 const LOOK: Duration = Duration::from_millis(100);
+/// How long the one who leaves still hears what the desk says about it.
+const LAST_WORDS: Duration = Duration::from_secs(1);
+/// And how long where the policy was laid out already, so that only the desk knows whether it was taken.
+const LAST_WORDS_LAID_OUT: Duration = Duration::from_secs(10);
 
 /// When the new policy takes over.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
@@ -105,10 +111,11 @@ pub(super) fn hear(stream: &UnixStream) -> io::Result<Request> {
 
 /// Asks the run on an instance to take over a bundle, and waits until it has or has not.
 ///
-/// `listen` is called with every answer. When `stop` is set or `patience` is over before the bundle was taken, it is withdrawn.
+/// `listen` is called with every answer. When `stop` is set or `patience` is over before the bundle was taken, it is withdrawn: the desk
+/// takes no bundle of somebody who had left before it was ready, so that nobody waits for a desk that is still loading.
 ///
 /// # Errors
-/// [`SwapError::NoDesk`] and [`SwapError::Conversation`]; a bundle that is refused is [`Answer::Refused`].
+/// [`SwapError::NoDesk`], [`SwapError::Stranger`] and [`SwapError::Conversation`]; a bundle that is refused is [`Answer::Refused`].
 pub fn ask(
     link: &LinkSettings,
     bundle: &Path,
@@ -120,12 +127,18 @@ pub fn ask(
     let no_desk = |source| SwapError::NoDesk { instance: link.instance.clone(), source };
     let stream = address(&desk_name(link)).and_then(|at| UnixStream::connect_addr(&at)).map_err(no_desk)?;
     let broken = |error: io::Error| SwapError::Conversation(format!("broke off: {error}"));
+    let user = user_of_peer(&stream).map_err(broken)?;
+    let own = rustix::process::geteuid().as_raw();
+    if user != own && user != 0 && own != 0 {
+        return Err(SwapError::Stranger { instance: link.instance.clone(), user });
+    }
     // The run may lie elsewhere in the file system than the one who asks.
     let bundle = std::path::absolute(bundle).map_err(broken)?;
     say(&stream, &Request { version: VERSION, bundle, when }).map_err(broken)?;
     stream.set_read_timeout(Some(LOOK)).map_err(broken)?;
     let start = Instant::now();
-    let (mut lines, mut line, mut leaving) = (BufReader::new(&stream), Vec::new(), false);
+    let (mut lines, mut line) = (BufReader::new(&stream), Vec::new());
+    let (mut leaving, mut ready) = (None::<Instant>, false);
     loop {
         match lines.read_until(b'\n', &mut line) {
             Ok(0) => {
@@ -136,6 +149,7 @@ pub fn ask(
                 let not_understood = |error| SwapError::Conversation(format!("is not understood: {error}"));
                 let answer: Answer = serde_json::from_slice(&line).map_err(not_understood)?;
                 listen(&answer);
+                ready |= matches!(answer, Answer::Ready { .. });
                 if answer.is_final() {
                     return Ok(answer);
                 }
@@ -147,12 +161,32 @@ pub fn ask(
             Err(error) => return Err(broken(error)),
         }
         let over = patience.is_some_and(|patience| start.elapsed() >= patience);
-        if !leaving && (over || stop.load(Ordering::Relaxed)) {
+        if leaving.is_none() && (over || stop.load(Ordering::Relaxed)) {
             // The desk sees that we leave, and still says how it ended.
             stream.shutdown(Shutdown::Write).map_err(broken)?;
-            leaving = true;
+            leaving = Some(Instant::now());
+        }
+        match leaving.map(|since| since.elapsed()) {
+            Some(waited) if !ready && waited >= LAST_WORDS => return Ok(Answer::Withdrawn),
+            Some(waited) if waited >= LAST_WORDS_LAID_OUT => {
+                let text = "does not answer; whether it took the bundle is not known";
+                return Err(SwapError::Conversation(text.into()));
+            }
+            _ => {}
         }
     }
+}
+
+/// The user of the process at the other end: of a desk, the one that opened it.
+pub(super) fn user_of_peer(stream: &UnixStream) -> io::Result<u32> {
+    let mut peer = libc::ucred { pid: 0, uid: 0, gid: 0 };
+    let mut len = size_of::<libc::ucred>() as libc::socklen_t;
+    let (place, len_place) = ((&raw mut peer).cast(), &raw mut len);
+    // SAFETY: the socket is open during the call, and the place is as long as `len` says.
+    let result = unsafe {
+        libc::getsockopt(stream.as_raw_fd(), libc::SOL_SOCKET, libc::SO_PEERCRED, place, len_place)
+    };
+    if result == 0 { Ok(peer.uid) } else { Err(io::Error::last_os_error()) }
 }
 
 pub(super) fn is_timeout(error: &io::Error) -> bool {

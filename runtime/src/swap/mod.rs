@@ -33,6 +33,7 @@ use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, Ordering};
 use std::sync::mpsc::channel;
 use std::thread::JoinHandle;
+use std::time::{Duration, Instant};
 
 use rcwm_models::bundle::BundleError;
 use rcwm_models::wire::LinkSettings;
@@ -82,9 +83,13 @@ pub enum SwapError {
          the run CAP_SYS_NICE"
     )]
     Helpers(io::Error),
+    /// The one who asked has left, or the run ends.
+    #[error("nobody wants the bundle any more")]
+    Unwanted,
     /// The desk could not be opened.
     #[error(
-        "opening the swap desk {name:?}: {source}; another run with this instance and RCWM_PREFIX may have it"
+        "the swap desk {name:?} cannot be opened: {source}; another run with this instance and RCWM_PREFIX may have it, also one in a \
+         container on this network"
     )]
     Desk {
         /// Name of the socket.
@@ -102,6 +107,17 @@ pub enum SwapError {
         instance: String,
         /// What the system said.
         source: io::Error,
+    },
+    /// Somebody else has the desk's name.
+    #[error(
+        "the swap desk of instance {instance:?} belongs to user {user}, who is neither you nor root: nothing was asked; start the run and \
+         this program as the same user"
+    )]
+    Stranger {
+        /// The instance.
+        instance: String,
+        /// The desk's user.
+        user: u32,
     },
     /// The run ended or spoke in a way that is not understood.
     #[error("the run on the instance {0}")]
@@ -123,6 +139,18 @@ pub struct SwapSettings {
     pub sampling: Sampling,
     /// Decisions per second of the running policy, in Hz; another policy must have the same.
     pub rate_hz: f64,
+}
+
+/// How long the end of a run waits for its desk.
+const PATIENCE: Duration = Duration::from_millis(500);
+/// A desk was left in the middle of its work.
+static DESK_LEFT: AtomicBool = AtomicBool::new(false);
+
+/// Whether a desk was still loading when its run ended. Its thread goes on, in memory that a process's usual end would tear down under
+/// it: such a process is to end at once.
+#[must_use]
+pub fn desk_is_left() -> bool {
+    DESK_LEFT.load(Ordering::Relaxed)
 }
 
 /// The controller's end: takes over a policy that is ready.
@@ -165,9 +193,18 @@ impl Swapper {
 impl Drop for Swapper {
     fn drop(&mut self) {
         self.stop.store(true, Ordering::Relaxed);
+        let start = Instant::now();
         // The desk first: the sweeper ends when nobody can bring it anything.
         for thread in self.desk.take().into_iter().chain(self.sweeper.take()) {
             thread.thread().unpark();
+            while !thread.is_finished() && start.elapsed() < PATIENCE {
+                std::thread::sleep(Duration::from_millis(2));
+            }
+            // Whatever a bundle makes it do, the end of the run does not wait for it.
+            if !thread.is_finished() {
+                DESK_LEFT.store(true, Ordering::Relaxed);
+                return;
+            }
             // A panic there has been printed; there is nothing left to do about it.
             let _ = thread.join();
         }

@@ -7,6 +7,10 @@
 //! [`ACTION_TOLERANCE`]. A class may flip where the trainer's own two best were nearly equal: every flip is listed with its margin,
 //! one with a margin of at most [`FLIP_MARGIN_MAX`] is accepted, and the run goes on from the trainer's state so that later
 //! ticks are still compared.
+//!
+//! **As deployed.** Engine and threads are those that will run. With 16-bit weights the exact tick is verified first, and then the rounded
+//! one from the trainer's state at every tick: it may be off by as much as rounding explains ([`HALF_ACTION_TOLERANCE`],
+//! [`HALF_FLIP_MARGIN_MAX`]).
 
 mod golden;
 mod half;
@@ -24,11 +28,16 @@ use serde::Serialize;
 use crate::engine::{self, EngineError, EngineKind, EngineSettings};
 use crate::policy::PolicyError;
 use golden::Golden;
+use recurrent::Start;
 
 /// Largest error of an action over the recurrent run.
 pub const ACTION_TOLERANCE: f32 = 1e-4;
 /// Largest margin between the two best classes for a flip to count as a tie.
 pub const FLIP_MARGIN_MAX: f32 = 1e-4;
+/// Largest error of an action from the trainer's state, with 16-bit weights: a fortieth of an action's range.
+pub const HALF_ACTION_TOLERANCE: f32 = 0.05;
+/// Largest margin between the two best classes, in nats, at which 16-bit weights may choose the other.
+pub const HALF_FLIP_MARGIN_MAX: f32 = 0.1;
 
 /// Why a bundle could not be verified.
 #[derive(Debug, thiserror::Error)]
@@ -133,22 +142,25 @@ pub struct EngineReport {
     pub unchecked_parts: Vec<PartName>,
     /// The whole tick.
     pub recurrent: RecurrentReport,
+    /// The whole tick with 16-bit weights, from the trainer's state each time; where they are deployed.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub half_weights: Option<RecurrentReport>,
     /// What is wrong, one line each; empty when all is well.
     pub failures: Vec<String>,
 }
 
-/// Verifies a bundle on one engine. `progress` is called with every unit of work done, of [`work_units`].
+/// Verifies a bundle in the form that `settings` deploy. `progress` is called with every unit of work done, of [`work_units`].
 ///
 /// # Errors
 /// See [`VerifyError`]. Differences are no errors but [`EngineReport::failures`].
 pub fn verify(
     bundle: &Bundle,
-    kind: EngineKind,
+    settings: EngineSettings,
     tolerance: f32,
     progress: &mut dyn FnMut(),
 ) -> Result<EngineReport, VerifyError> {
     let golden = Golden::of(bundle)?;
-    let settings = EngineSettings::single_threaded(kind);
+    let kind = settings.kind;
     engine::available(kind)?;
     let (mut parts, mut unchecked_parts) = (Vec::new(), Vec::new());
     let mut checker = parts::Checker::new(bundle, &golden, settings)?;
@@ -159,9 +171,15 @@ pub fn verify(
             unchecked_parts.push(part);
         }
     }
-    let recurrent = recurrent::run(bundle, &golden, settings, progress)?;
-    let failures = failures(&parts, &recurrent, tolerance);
-    Ok(EngineReport { engine: kind, parts, unchecked_parts, recurrent, failures })
+    let exact = settings.with_half_weights(false);
+    let recurrent = recurrent::run(bundle, &golden, exact, Start::Own, progress)?;
+    let half_weights = match settings.has_half_weights() {
+        true => Some(recurrent::run(bundle, &golden, settings, Start::Golden, &mut || {})?),
+        false => None,
+    };
+    let mut failures = failures(&parts, &recurrent, tolerance);
+    failures.extend(half_weights.iter().flat_map(half_failures));
+    Ok(EngineReport { engine: kind, parts, unchecked_parts, recurrent, half_weights, failures })
 }
 
 /// Units of work of [`verify`] on one engine.
@@ -189,12 +207,30 @@ fn failures(parts: &[PartReport], recurrent: &RecurrentReport, tolerance: f32) -
         failures.extend(clear_flips(&format!("{} alone", part.part), &part.flips));
     }
     failures.extend(clear_flips("recurrent run", &recurrent.flips));
-    for (what, error) in [("mean", recurrent.mean_error_max), ("std", recurrent.std_error_max)] {
-        if exceeds(error, ACTION_TOLERANCE) {
-            failures.push(format!(
-                "recurrent run: the action's {what} is {error:.2e} off, accepted is {ACTION_TOLERANCE:.0e}"
-            ));
-        }
+    failures.extend(action_failures("recurrent run", recurrent, ACTION_TOLERANCE));
+    failures
+}
+
+fn action_failures(run: &str, report: &RecurrentReport, tolerance: f32) -> Vec<String> {
+    let errors = [("mean", report.mean_error_max), ("std", report.std_error_max)].into_iter();
+    let wrong = errors.filter(|(_, error)| exceeds(*error, tolerance));
+    wrong
+        .map(|(what, error)| {
+            format!("{run}: the action's {what} is {error:.2e} off, accepted is {tolerance:.0e}")
+        })
+        .collect()
+}
+
+/// What rounding the weights does not explain.
+fn half_failures(report: &RecurrentReport) -> Vec<String> {
+    let mut failures = action_failures("16-bit weights", report, HALF_ACTION_TOLERANCE);
+    let clear = |flip: &&Flip| !flip.follows && exceeds(flip.margin, HALF_FLIP_MARGIN_MAX);
+    if let Some(flip) = report.flips.iter().find(clear) {
+        failures.push(format!(
+            "16-bit weights: at tick {} {} {} is another class by a margin of {:.2e}, accepted is \
+             {HALF_FLIP_MARGIN_MAX:.0e}",
+            flip.tick, flip.branch, flip.output, flip.margin
+        ));
     }
     failures
 }

@@ -8,10 +8,20 @@ use super::{Flip, RecurrentReport, VerifyError};
 use crate::engine::EngineSettings;
 use crate::policy::{Buffers, Policy, Sampling};
 
+/// The state that a tick starts from.
+#[derive(Clone, Copy, PartialEq)]
+pub(super) enum Start {
+    /// What the tick before it has left.
+    Own,
+    /// What the trainer had.
+    Golden,
+}
+
 pub(super) fn run(
     bundle: &Bundle,
     golden: &Golden<'_>,
     settings: EngineSettings,
+    start: Start,
     progress: &mut dyn FnMut(),
 ) -> Result<RecurrentReport, VerifyError> {
     let mut policy = Policy::new(bundle, settings, Sampling::Mode)?;
@@ -31,11 +41,12 @@ pub(super) fn run(
         let flips = flips_of(golden, policy.buffers(), tick)?;
         if flips.is_empty() {
             report.compare(golden, policy.buffers(), tick)?;
-        } else {
-            // The state would go its own way from here: go on from the trainer's, so that later ticks still tell something.
-            policy.set_state(&golden.state_after(tick)?)?;
-            report.flips.extend(flips);
         }
+        // After a flip the state would go its own way: it goes on from the trainer's, so that later ticks still tell something.
+        if start == Start::Golden || !flips.is_empty() {
+            policy.set_state(&golden.state_after(tick)?)?;
+        }
+        report.flips.extend(flips);
     }
     Ok(report)
 }

@@ -10,7 +10,11 @@ impl<'a> Attributes<'a> {
         let all: Vec<&Attribute> = node.attribute.iter().collect();
         // Each is compared with those before it: there are few.
         if all.len() > Amounts::NODE_ATTRIBUTES {
-            return Err(format!("{} attributes, at most {} are accepted", all.len(), Amounts::NODE_ATTRIBUTES));
+            return Err(format!(
+                "{} attributes, at most {} are accepted",
+                all.len(),
+                Amounts::NODE_ATTRIBUTES
+            ));
         }
         for (index, attribute) in all.iter().enumerate() {
             if all[..index].iter().any(|before| before.name == attribute.name) {

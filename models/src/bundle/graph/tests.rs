@@ -86,7 +86,8 @@ fn an_output_that_jumps_only_for_some_action_is_refused_as_well() {
     let check_jumps = |jumps: [i64; 2]| {
         let mut model = model.clone();
         model.graph.as_mut().unwrap().initializer = vec![Tensor::i64("jumps", &[2], &jumps)];
-        let inputs = [TensorSpec::new("z", DType::I64, &[1, 1]), TensorSpec::new("scores", DType::F32, &[1, 2])];
+        let inputs =
+            [TensorSpec::new("z", DType::I64, &[1, 1]), TensorSpec::new("scores", DType::F32, &[1, 2])];
         check(&model, &inputs, &[TensorSpec::new("out", DType::I64, &[1, 1])], 4)
     };
     check_jumps([0, 0]).unwrap();

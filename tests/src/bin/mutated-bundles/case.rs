@@ -7,7 +7,7 @@ use rcwm_models::bundle::MANIFEST_FILE;
 use rcwm_models::tensors::{Tensors, Values};
 
 use crate::bundle::{Files, Original};
-use crate::graph;
+use crate::{bomb, graph};
 
 /// Numbers at which programs break.
 pub(crate) const HARD_INTEGERS: [i64; 14] =
@@ -26,7 +26,8 @@ impl Case {
     pub(crate) fn of(seed: u64, original: &Original) -> Self {
         let rng = &mut ChaCha8Rng::seed_from_u64(seed);
         match rng.random_range(0..100) {
-            0..20 => manifest_text(rng, original),
+            0..16 => manifest_text(rng, original),
+            16..20 => small_for_its_cost(rng, original),
             20..35 => damaged_bytes(rng, original, false),
             35..60 => damaged_bytes(rng, original, true),
             60..90 => changed_graph(rng, original),
@@ -42,6 +43,11 @@ impl Case {
         files.insert(name.to_owned(), bytes);
         Self { what: format!("{name}: {what}{}", if repair { ", checksum repaired" } else { "" }), files }
     }
+}
+
+fn small_for_its_cost(rng: &mut ChaCha8Rng, original: &Original) -> Case {
+    let (what, name, bytes) = bomb::of(rng, original);
+    Case::one(original, what, &name, bytes, name != MANIFEST_FILE)
 }
 
 fn manifest_text(rng: &mut ChaCha8Rng, original: &Original) -> Case {

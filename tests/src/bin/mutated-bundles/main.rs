@@ -1,10 +1,12 @@
 //! Loads thousands of damaged bundles as the runtime does and proves that none makes it panic, hang or ask for much memory.
 //!
 //! Every case is made from its seed: bit flips, truncations and grafts of the files' bytes, changes of the manifest's text, and
-//! changes of graph, shapes and attributes behind a repaired checksum, so that parsers and engine see the damage. A case is
+//! changes of graph, shapes and attributes behind a repaired checksum, so that parsers and engine see the damage; and files that are
+//! small for what they make a reader do. A case is
 //! worked on in a child process whose memory is limited by the kernel, and watched by the parent; a child that dies, is stopped
 //! or grows is a finding, printed with the seed that makes the same case again.
 
+mod bomb;
 mod bundle;
 mod case;
 mod child;

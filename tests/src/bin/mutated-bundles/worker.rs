@@ -10,7 +10,7 @@ use rcwm_models::IMAGE_BYTES;
 use rcwm_models::bundle::Bundle;
 use rcwm_models::errors::one_line;
 use rcwm_runtime::policy::Sampling;
-use rcwm_runtime::{Decision, EngineKind, EngineSettings, Policy};
+use rcwm_runtime::{Decision, EngineSettings, Policy};
 use rustix::process::{Resource, Rlimit, setrlimit};
 use rustix::time::{ClockId, clock_gettime};
 use serde::{Deserialize, Serialize};
@@ -109,7 +109,7 @@ fn use_as_the_runtime_does(folder: &Path) -> (&'static str, String) {
         Ok(false) => return ("unfit action", String::new()),
         Err(error) => return ("tick", one_line(&error)),
     }
-    match rcwm_runtime::verify::verify(&bundle, EngineKind::Tract, TOLERANCE, &mut || {}) {
+    match rcwm_runtime::verify::verify(&bundle, EngineSettings::tract(), TOLERANCE, &mut || {}) {
         Ok(report) if report.failures.is_empty() => ("accepted", String::new()),
         Ok(report) => ("verify", report.failures.join("; ")),
         Err(error) => ("verify", one_line(&error)),

@@ -5,7 +5,6 @@
 //! at an episode's start, with bad bundles in between that must be refused.
 
 mod bad;
-mod stream;
 
 use std::path::{Path, PathBuf};
 use std::process::{Child, Command, ExitCode, Stdio};
@@ -18,10 +17,10 @@ use clap::Parser;
 use rcwm_models::bundle::Bundle;
 use rcwm_models::wire::{LinkSettings, SimulatorLink, forget_prefix, list_leftovers};
 use rcwm_runtime::swap::{Answer, When, ask};
+use rcwm_tests::stream::{PhaseReport, Stream};
 use serde::Serialize;
 
 use bad::BadBundles;
-use stream::{PhaseReport, Stream};
 
 /// The stream's phase without swaps, and the one with them.
 const PHASES: [&str; 2] = ["without swaps", "with swaps"];

@@ -13,35 +13,42 @@ use rustix::thread::clock_nanosleep_absolute;
 use rustix::time::{ClockId, Timespec};
 use serde::Serialize;
 
-/// One phase.
+/// What came of one phase.
 #[derive(Debug, Clone, Default, Serialize)]
-pub(crate) struct PhaseReport {
-    phase: String,
-    observations: u64,
+pub struct PhaseReport {
+    /// Its name.
+    pub phase: String,
+    /// Observations published.
+    pub observations: u64,
     /// Answered by the policy within a period of when they were due.
-    in_time: u64,
+    pub in_time: u64,
     /// Answered later, or not at all.
-    missed: u64,
+    pub missed: u64,
     /// Those of them that were answered within a period of being published: the stream itself was late.
-    missed_published_late: u64,
+    pub missed_published_late: u64,
     /// Answered by something else than the policy.
-    not_by_policy: u64,
+    pub not_by_policy: u64,
     /// From publishing to the action's publishing, in us.
-    latency_us: Percentiles,
+    pub latency_us: Percentiles,
     #[serde(skip)]
     latencies_ns: Vec<u64>,
 }
 
+/// Percentiles of a phase.
 #[derive(Debug, Clone, Copy, Default, Serialize)]
-struct Percentiles {
-    p50: f64,
-    p99: f64,
-    p99_9: f64,
-    max: f64,
+pub struct Percentiles {
+    /// Median.
+    pub p50: f64,
+    /// 99 of 100 are at most this.
+    pub p99: f64,
+    /// 999 of 1000 are at most this.
+    pub p99_9: f64,
+    /// Longest.
+    pub max: f64,
 }
 
 /// What the robot sends.
-pub(crate) struct Stream<'a> {
+pub struct Stream<'a> {
     peer: &'a SimulatorLink,
     images: Vec<[u8; IMAGE_BYTES]>,
     period_ns: u64,
@@ -54,12 +61,10 @@ pub(crate) struct Stream<'a> {
 
 impl<'a> Stream<'a> {
     /// The images are those of the bundle's golden values.
-    pub(crate) fn new(
-        peer: &'a SimulatorLink,
-        bundle: &Bundle,
-        rate_hz: f64,
-        episode: u32,
-    ) -> anyhow::Result<Self> {
+    ///
+    /// # Errors
+    /// If the bundle has none, or no robot has such a rate.
+    pub fn new(peer: &'a SimulatorLink, bundle: &Bundle, rate_hz: f64, episode: u32) -> anyhow::Result<Self> {
         let images = bundle.golden.u8("input/image")?;
         let bytes = images.as_slice().context("golden images lie in order")?;
         let images = bytes.as_chunks::<IMAGE_BYTES>().0.to_vec();
@@ -88,7 +93,10 @@ impl<'a> Stream<'a> {
     }
 
     /// Sends the first observation until somebody answers it.
-    pub(crate) fn wait_for_controller(&mut self, stop: &AtomicBool) -> anyhow::Result<()> {
+    ///
+    /// # Errors
+    /// Those of the link; or nobody answers within a minute.
+    pub fn wait_for_controller(&mut self, stop: &AtomicBool) -> anyhow::Result<()> {
         for _ in 0..600 {
             anyhow::ensure!(!stop.load(Ordering::Relaxed), "interrupted");
             self.publish(monotonic_ns(), true)?;
@@ -101,7 +109,10 @@ impl<'a> Stream<'a> {
     }
 
     /// Plays until `done`; what happens is counted to the phase that is.
-    pub(crate) fn play(
+    ///
+    /// # Errors
+    /// Those of the link.
+    pub fn play(
         &mut self,
         phases: &[&str],
         phase: &AtomicUsize,
@@ -178,7 +189,9 @@ impl PhaseReport {
         self.latency_us = Percentiles { p50: at(0.5), p99: at(0.99), p99_9: at(0.999), max: at(1.0) };
     }
 
-    pub(crate) fn text(&self) -> String {
+    /// One line for people.
+    #[must_use]
+    pub fn text(&self) -> String {
         let Self { phase, observations, missed, missed_published_late, not_by_policy, latency_us: l, .. } =
             self;
         format!(
