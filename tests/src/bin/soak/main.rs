@@ -2,8 +2,9 @@
 //!
 //! A robot with recorded images on a fixed clock, `rcwm-runtime run` with log and telemetry, and a swap every so often, at once and at an
 //! episode's start in turn: real processes on a real link. Meanwhile the run's resident memory, threads and open files are sampled. The
-//! report has a row for each tenth of the time; **drift** is the median of the last tenth against that of the second one, which is after
-//! the warm-up.
+//! report has a row for each tenth of the time; **drift** is the median of the last tenth against that of the second one. The first is
+//! the warm-up, with some swaps in quick succession: what a swap frees the allocator keeps for the next one, and it takes about ten of
+//! them until no piece that is needed is missing.
 
 mod report;
 mod samples;
@@ -36,7 +37,7 @@ const REPORT: Duration = Duration::from_secs(60);
     name = "soak",
     after_help = "Examples:\n  \
     soak --minutes 120 --json soak.json\n  \
-    soak --minutes 10 --swap-every-s 60 --bundle models/bundles/hammer --other models/bundles/reach -- --realtime\n\n\
+    soak --minutes 10 --swap-every-s 60 --warm-up-swaps 10 --bundle models/bundles/hammer --other models/bundles/reach -- --realtime\n\n\
     What follows -- goes to `rcwm-runtime run`. Ctrl-C ends it early, with the report. Exits 0 if every swap was taken, memory's drift\n\
     is below --drift-max-mib, and nothing was left in shared memory."
 )]
@@ -53,6 +54,9 @@ struct Arguments {
     /// Time between two swaps, in seconds
     #[arg(long, value_name = "SECONDS", default_value_t = 600.0, value_parser = positive)]
     swap_every_s: f64,
+    /// Swaps in the first tenth of the time, which is the warm-up
+    #[arg(long, value_name = "N", default_value_t = 16)]
+    warm_up_swaps: u32,
     /// Time between two looks at the run's memory, in seconds
     #[arg(long, value_name = "SECONDS", default_value_t = 5.0, value_parser = positive)]
     sample_every_s: f64,
@@ -224,9 +228,13 @@ impl Clock<'_> {
     /// Asks for one swap after another.
     fn swap(&self, link: &LinkSettings) -> anyhow::Result<()> {
         let start = Instant::now();
-        let Arguments { bundle, other, swap_every_s, .. } = self.arguments;
+        let Arguments { bundle, other, swap_every_s, warm_up_swaps, .. } = self.arguments;
+        let (warm_up, warm_up_swaps) = (self.length() / TENTHS.len() as u32, *warm_up_swaps);
         for round in 1_u32.. {
-            let due = Duration::from_secs_f64(swap_every_s * f64::from(round));
+            let due = match round.checked_sub(warm_up_swaps) {
+                Some(later @ 1..) => warm_up + Duration::from_secs_f64(swap_every_s * f64::from(later)),
+                _ => warm_up * round / (warm_up_swaps + 1),
+            };
             while start.elapsed() < due {
                 if self.is_over() {
                     return Ok(());
