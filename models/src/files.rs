@@ -1,9 +1,12 @@
 //! Files as a deployed system needs them: written atomically, read with a limit, checked by sha256.
 
-use std::fs::{self, File};
+use std::ffi::OsString;
+use std::fs::{self, File, OpenOptions, Permissions};
 use std::io::{self, Read, Write};
+use std::os::unix::fs::{OpenOptionsExt, PermissionsExt};
 use std::path::{Path, PathBuf};
 
+use rustix::fs::OFlags;
 use sha2::{Digest, Sha256};
 
 /// Why a file could not be read or written.
@@ -28,9 +31,15 @@ pub enum FileError {
         limit: u64,
     },
     /// The path names something that is not a plain file.
-    #[error("{path} is not a plain file (a link, a folder or a device is not accepted here)")]
+    #[error("{path} is not a plain file (it is a folder, a device or a pipe)")]
     NotAFile {
         /// The path.
+        path: PathBuf,
+    },
+    /// The file is there and must not be written over.
+    #[error("{path} exists already and is not written over; remove it, or choose another place")]
+    Exists {
+        /// The file.
         path: PathBuf,
     },
 }
@@ -42,12 +51,17 @@ impl FileError {
     }
 }
 
-/// Reads a whole plain file of at most `bytes_max` bytes; links are not followed.
+/// Reads a whole plain file of at most `bytes_max` bytes. Links are followed: data are often links into a store of large files.
+///
+/// What is checked is what is read: a link that is turned elsewhere meanwhile changes nothing. A pipe is refused, not waited for.
 ///
 /// # Errors
 /// [`FileError::NotAFile`], [`FileError::TooLarge`] before anything is read, or [`FileError::Io`].
 pub fn read_capped(path: &Path, bytes_max: u64) -> Result<Vec<u8>, FileError> {
-    let meta = fs::symlink_metadata(path).map_err(FileError::io(path))?;
+    let without_waiting = OFlags::NONBLOCK.bits() as i32;
+    let open = OpenOptions::new().read(true).custom_flags(without_waiting).open(path);
+    let file = open.map_err(FileError::io(path))?;
+    let meta = file.metadata().map_err(FileError::io(path))?;
     if !meta.is_file() {
         return Err(FileError::NotAFile { path: path.to_path_buf() });
     }
@@ -56,7 +70,6 @@ pub fn read_capped(path: &Path, bytes_max: u64) -> Result<Vec<u8>, FileError> {
         return Err(too_large(meta.len()));
     }
     let mut bytes = Vec::with_capacity(meta.len() as usize);
-    let file = File::open(path).map_err(FileError::io(path))?;
     // The file may grow between the check and the read: the reader is limited as well.
     file.take(bytes_max + 1).read_to_end(&mut bytes).map_err(FileError::io(path))?;
     if bytes.len() as u64 > bytes_max {
@@ -66,30 +79,106 @@ pub fn read_capped(path: &Path, bytes_max: u64) -> Result<Vec<u8>, FileError> {
 }
 
 /// Writes `bytes` so that a reader sees the old file or the whole new one, also after a crash:
-/// temporary file in the same folder, fsync, rename, fsync of the folder.
+/// temporary file in the same folder, fsync, rename, fsync of the folder. Where the path is a link, what it leads to is replaced; a
+/// device or a pipe (`/dev/stdout`) is written to.
 ///
 /// # Errors
-/// [`FileError::Io`]; the old file is then untouched.
+/// [`FileError::Io`]; the old file is then untouched. [`FileError::NotAFile`] where the path is a folder.
 pub fn write_atomic(path: &Path, bytes: &[u8]) -> Result<(), FileError> {
-    let folder = match path.parent() {
-        Some(parent) if !parent.as_os_str().is_empty() => parent,
-        _ => Path::new("."),
-    };
-    let mut temporary =
-        tempfile::Builder::new().prefix(".writing-").tempfile_in(folder).map_err(FileError::io(path))?;
+    match fs::metadata(path) {
+        Ok(meta) if meta.is_dir() => Err(FileError::NotAFile { path: path.to_path_buf() }),
+        Ok(meta) if !meta.is_file() => OpenOptions::new()
+            .write(true)
+            .open(path)
+            .and_then(|mut file| file.write_all(bytes))
+            .map_err(FileError::io(path)),
+        Ok(_) => {
+            let path = fs::canonicalize(path).map_err(FileError::io(path))?;
+            let (temporary, folder) = written(&path, bytes)?;
+            temporary.persist(&path).map_err(|error| FileError::io(&path)(error.error))?;
+            sync(&folder)
+        }
+        Err(_) => {
+            let (temporary, folder) = written(path, bytes)?;
+            temporary.persist(path).map_err(|error| FileError::io(path)(error.error))?;
+            sync(&folder)
+        }
+    }
+}
+
+/// The same of a new file: one that is there stays as it is, also where two programs write it at a time.
+///
+/// # Errors
+/// [`FileError::Exists`] or [`FileError::Io`].
+pub fn write_new(path: &Path, bytes: &[u8]) -> Result<(), FileError> {
+    let (temporary, folder) = written(path, bytes)?;
+    temporary.persist_noclobber(path).map_err(|error| match error.error.kind() {
+        io::ErrorKind::AlreadyExists => FileError::Exists { path: path.to_path_buf() },
+        _ => FileError::io(path)(error.error),
+    })?;
+    sync(&folder)
+}
+
+/// A temporary file beside `path` that holds `bytes` on the disk, and its folder.
+fn written(path: &Path, bytes: &[u8]) -> Result<(tempfile::NamedTempFile, PathBuf), FileError> {
+    let folder = folder_of(path);
+    // Readable for whom the umask lets read; temporary files are private to their owner by default.
+    let mut temporary = tempfile::Builder::new()
+        .prefix(".writing-")
+        .permissions(Permissions::from_mode(0o666))
+        .tempfile_in(&folder)
+        .map_err(FileError::io(path))?;
     temporary.write_all(bytes).map_err(FileError::io(path))?;
-    make_readable(temporary.as_file()).map_err(FileError::io(path))?;
     temporary.as_file().sync_all().map_err(FileError::io(path))?;
-    temporary
-        .persist(path)
-        .map_err(|error| FileError::Io { path: path.to_path_buf(), source: error.error })?;
+    Ok((temporary, folder))
+}
+
+fn sync(folder: &Path) -> Result<(), FileError> {
     File::open(folder).and_then(|folder| folder.sync_all()).map_err(FileError::io(folder))
 }
 
-/// Temporary files start private to their owner; results are for everybody the folder is for.
-fn make_readable(file: &File) -> io::Result<()> {
-    use std::os::unix::fs::PermissionsExt;
-    file.set_permissions(fs::Permissions::from_mode(0o644))
+fn folder_of(path: &Path) -> PathBuf {
+    match path.parent() {
+        Some(parent) if !parent.as_os_str().is_empty() => parent.to_path_buf(),
+        _ => PathBuf::from("."),
+    }
+}
+
+/// Makes sure, before long work begins, that a file can be written there when it is done: its folder is made where it is missing, and a
+/// path that is a folder, or where nothing can be written, is an error now. `-` is standard output.
+///
+/// # Errors
+/// [`FileError::NotAFile`] or [`FileError::Io`].
+pub fn prepare_output(path: &Path) -> Result<(), FileError> {
+    if path == Path::new("-") {
+        return Ok(());
+    }
+    match fs::metadata(path) {
+        Ok(meta) if meta.is_dir() => return Err(FileError::NotAFile { path: path.to_path_buf() }),
+        Ok(meta) if !meta.is_file() => return Ok(()),
+        _ => {}
+    }
+    let path = fs::canonicalize(path).unwrap_or_else(|_| path.to_path_buf());
+    let folder = folder_of(&path);
+    fs::create_dir_all(&folder).map_err(FileError::io(&folder))?;
+    tempfile::Builder::new().prefix(".writing-").tempfile_in(&folder).map(drop).map_err(FileError::io(&path))
+}
+
+/// The first of `name.ext`, `name-2.ext`, `name-3.ext`, ... for which `is_free` holds.
+pub fn free_name(path: &Path, mut is_free: impl FnMut(&Path) -> bool) -> PathBuf {
+    let numbered = |number: u64| {
+        if number == 1 {
+            return path.to_path_buf();
+        }
+        let mut name: OsString = path.file_stem().unwrap_or_default().to_owned();
+        name.push(format!("-{number}"));
+        if let Some(extension) = path.extension() {
+            name.push(".");
+            name.push(extension);
+        }
+        path.with_file_name(name)
+    };
+    (1..).map(numbered).find(|path| is_free(path)).unwrap_or_else(|| path.to_path_buf())
 }
 
 /// Lower-case hexadecimal sha256 of `bytes`.
@@ -105,6 +194,8 @@ pub fn sha256_hex(bytes: &[u8]) -> String {
 
 #[cfg(test)]
 mod tests {
+    use std::os::unix::fs::{MetadataExt, symlink};
+
     use super::*;
 
     #[test]
@@ -118,14 +209,85 @@ mod tests {
     }
 
     #[test]
-    fn a_file_over_the_limit_and_a_link_are_refused() {
+    fn a_link_is_read_with_the_limit_of_what_it_leads_to() {
+        let folder = tempfile::tempdir().unwrap();
+        let (path, link) = (folder.path().join("a.bin"), folder.path().join("link"));
+        write_atomic(&path, &[0; 10]).unwrap();
+        symlink("a.bin", &link).unwrap();
+        for name in [&path, &link] {
+            assert_eq!(read_capped(name, 10).unwrap(), [0; 10]);
+            assert!(matches!(read_capped(name, 9), Err(FileError::TooLarge { found: 10, limit: 9, .. })));
+        }
+    }
+
+    #[test]
+    fn folders_devices_and_pipes_are_refused_at_once_also_behind_a_link() {
+        let folder = tempfile::tempdir().unwrap();
+        let (pipe, link) = (folder.path().join("pipe"), folder.path().join("link"));
+        rustix::fs::mknodat(
+            rustix::fs::CWD,
+            &pipe,
+            rustix::fs::FileType::Fifo,
+            rustix::fs::Mode::RUSR | rustix::fs::Mode::WUSR,
+            0,
+        )
+        .unwrap();
+        symlink(&pipe, &link).unwrap();
+        for path in [folder.path(), &pipe, &link, "/dev/zero".as_ref()] {
+            assert!(matches!(read_capped(path, 100), Err(FileError::NotAFile { .. })), "{}", path.display());
+        }
+    }
+
+    #[test]
+    fn a_link_is_kept_and_what_it_leads_to_is_replaced() {
+        let folder = tempfile::tempdir().unwrap();
+        let (path, link) = (folder.path().join("a.bin"), folder.path().join("link"));
+        write_atomic(&path, b"old").unwrap();
+        symlink("a.bin", &link).unwrap();
+        write_atomic(&link, b"new").unwrap();
+        assert_eq!(fs::read(&path).unwrap(), b"new");
+        assert!(fs::symlink_metadata(&link).unwrap().is_symlink());
+    }
+
+    #[test]
+    fn a_device_is_written_to_and_stays_one() {
+        let before = fs::metadata("/dev/null").unwrap();
+        write_atomic("/dev/null".as_ref(), b"gone").unwrap();
+        let after = fs::metadata("/dev/null").unwrap();
+        assert_eq!((before.file_type(), before.ino()), (after.file_type(), after.ino()));
+        assert!(write_atomic("/dev/full".as_ref(), b"lost").is_err(), "what cannot be written is an error");
+    }
+
+    #[test]
+    fn a_new_file_never_replaces_one_that_is_there() {
         let folder = tempfile::tempdir().unwrap();
         let path = folder.path().join("a.bin");
-        write_atomic(&path, &[0; 10]).unwrap();
-        assert!(matches!(read_capped(&path, 9), Err(FileError::TooLarge { found: 10, limit: 9, .. })));
-        let link = folder.path().join("link");
-        std::os::unix::fs::symlink(&path, &link).unwrap();
-        assert!(matches!(read_capped(&link, 100), Err(FileError::NotAFile { .. })));
+        write_new(&path, b"first").unwrap();
+        assert!(matches!(write_new(&path, b"second"), Err(FileError::Exists { .. })));
+        assert_eq!(fs::read(&path).unwrap(), b"first");
+        assert_eq!(fs::read_dir(folder.path()).unwrap().count(), 1);
+    }
+
+    #[test]
+    fn an_output_is_found_unwritable_before_the_work() {
+        let folder = tempfile::tempdir().unwrap();
+        let path = folder.path().join("not/yet/there/a.json");
+        prepare_output(&path).unwrap();
+        write_atomic(&path, b"{}").unwrap();
+        prepare_output(&path).unwrap();
+        assert_eq!(fs::read(&path).unwrap(), b"{}", "what is there is not touched");
+        assert!(matches!(prepare_output(folder.path()), Err(FileError::NotAFile { .. })));
+        let error = prepare_output(&path.join("below/a.json")).unwrap_err().to_string();
+        assert!(error.contains("a.json"), "{error}");
+        prepare_output("/dev/null".as_ref()).unwrap();
+    }
+
+    #[test]
+    fn names_that_are_taken_are_numbered() {
+        let taken = ["a/log.x", "a/log-2.x"];
+        let free = |path: &str| free_name(path.as_ref(), |name| !taken.contains(&name.to_str().unwrap()));
+        assert_eq!(free("a/log.x"), Path::new("a/log-3.x"));
+        assert_eq!(free("a/other"), Path::new("a/other"));
     }
 
     #[test]

@@ -11,6 +11,8 @@
 //! | [`tensors`] | named arrays in safetensors files |
 //! | [`errors`] | errors as one line for people |
 //! | [`files`] | atomic writes, checksums, capped reads |
+//! | [`lock`] | one writer a folder |
+//! | [`terminal`] | printing that survives a closed pipe and a full disk; lines of progress without a terminal |
 //!
 //! This crate never depends on candle, tract or pyo3.
 
@@ -18,10 +20,12 @@ pub mod bundle;
 pub mod episode;
 pub mod errors;
 pub mod files;
+pub mod lock;
 pub mod onnx;
 pub mod settings;
 pub mod tasks;
 pub mod tensors;
+pub mod terminal;
 pub mod wire;
 
 /// Side of the square images on the wire and into the encoder, in pixels.

@@ -9,14 +9,19 @@
 //! | `robot_mask` (optional) | u8 | [T, 64, 64, 1] | 1 where the robot is, else 0 |
 //! | `proprio` (optional) | f32 | [T, 18] | joint positions and velocities |
 //! | `disturbed` (optional) | u8 | [T, 64, 64, 3] | the same moments in another look |
+//!
+//! These are written. Read is what numpy reads and others write: numbers of any size and byte order, Fortran order, axes of length 1
+//! more or less (`[T, 1]` for `[T]`), masks as 0 and 255 or as numbers of objects. An action that stands at the image it was
+//! chosen on, as danijar/dreamerv3 stores it, is refused.
 
+mod npy;
 mod npz;
 
 use std::path::{Path, PathBuf};
 
 use ndarray::{Array1, Array2, Array3, Array4, Axis, Slice};
 
-use crate::files::{FileError, read_capped, write_atomic};
+use crate::files::{FileError, read_capped, write_atomic, write_new};
 use crate::wire::{Observation, ObservationFlags};
 use crate::{ACTION_LEN, IMAGE_CHANNELS, IMAGE_SIDE, PROPRIOCEPTION_LEN};
 
@@ -165,6 +170,22 @@ impl Episode {
         npz::read(path, &bytes)
     }
 
+    /// The same, but never over a file that is there.
+    ///
+    /// # Errors
+    /// [`FileError::Exists`] or see [`EpisodeError`].
+    pub fn write_new(&self, path: &Path) -> Result<(), EpisodeError> {
+        Ok(write_new(path, &self.to_bytes(path)?)?)
+    }
+
+    /// The file that [`Episode::write`] writes; `path` is for messages.
+    ///
+    /// # Errors
+    /// [`EpisodeError::Archive`].
+    pub fn to_bytes(&self, path: &Path) -> Result<Vec<u8>, EpisodeError> {
+        npz::to_bytes(self).map_err(|reason| EpisodeError::Archive { path: path.to_path_buf(), reason })
+    }
+
     /// Whether a `.npz` file has disturbed pictures; the pictures themselves are not read.
     ///
     /// # Errors
@@ -178,9 +199,19 @@ impl Episode {
     /// # Errors
     /// See [`EpisodeError`].
     pub fn write(&self, path: &Path) -> Result<(), EpisodeError> {
-        let bytes = npz::to_bytes(self)
-            .map_err(|reason| EpisodeError::Archive { path: path.to_path_buf(), reason })?;
-        Ok(write_atomic(path, &bytes)?)
+        Ok(write_atomic(path, &self.to_bytes(path)?)?)
+    }
+}
+
+/// Above which value a pixel of a mask is the robot, by the largest one in all masks of an episode. Grey ones (255 or 65535 for white)
+/// are cut at half of white; small numbers are those of objects, of which every one counts.
+#[must_use]
+pub fn robot_above(largest: f64) -> f64 {
+    match largest {
+        x if x <= 127.0 => 0.0,
+        x if x <= 255.0 => 127.0,
+        x if x <= 32767.0 => 0.0,
+        _ => 32767.0,
     }
 }
 
@@ -260,6 +291,9 @@ impl EpisodeBuilder {
         let mut is_first = bits(ObservationFlags::FIRST);
         is_first[0] = true;
         let fits = "pushed in whole steps";
+        let mut action = Array2::from_shape_vec((steps, ACTION_LEN), this.action).expect(fits);
+        // No action led to the first step of what was seen, also where it was joined in its middle.
+        action.row_mut(0).fill(0.0);
         Some(Episode {
             is_last: bits(ObservationFlags::LAST),
             is_terminal: bits(ObservationFlags::TERMINAL),
@@ -268,7 +302,7 @@ impl EpisodeBuilder {
             is_first,
             image: Array4::from_shape_vec((steps, IMAGE_SIDE, IMAGE_SIDE, IMAGE_CHANNELS), this.image)
                 .expect(fits),
-            action: Array2::from_shape_vec((steps, ACTION_LEN), this.action).expect(fits),
+            action,
             reward: this.reward.into(),
             robot_mask: (this.masks == steps).then(|| {
                 Array3::from_shape_vec((steps, IMAGE_SIDE, IMAGE_SIDE), this.robot_mask).expect(fits)

@@ -1,0 +1,168 @@
+//! What programs say on standard output and standard error. A pipe that was closed (`| head`) or a full disk never ends a program:
+//! `println!` would panic. What standard output has lost is told at the end, by [`finish`].
+
+use std::fmt::Arguments;
+use std::io::{self, Write};
+use std::sync::atomic::{AtomicBool, AtomicI32, Ordering};
+use std::sync::mpsc::{RecvTimeoutError, Sender, channel};
+use std::thread::JoinHandle;
+use std::time::Duration;
+
+/// Nobody reads standard output any more.
+static CLOSED: AtomicBool = AtomicBool::new(false);
+/// The first error of writing to standard output, as the system numbers it; 0 for none.
+static LOST: AtomicI32 = AtomicI32::new(0);
+
+/// Prints to standard output, as `print!` does; for [`out!`](crate::out).
+pub fn print(text: Arguments<'_>) {
+    if CLOSED.load(Ordering::Relaxed) {
+        return;
+    }
+    let mut out = io::stdout().lock();
+    match out.write_fmt(text).and_then(|()| out.flush()) {
+        Ok(()) => {}
+        Err(error) if error.kind() == io::ErrorKind::BrokenPipe => CLOSED.store(true, Ordering::Relaxed),
+        Err(error) => {
+            let number = error.raw_os_error().unwrap_or(-1);
+            // The first one counts.
+            let _ = LOST.compare_exchange(0, number, Ordering::Relaxed, Ordering::Relaxed);
+        }
+    }
+}
+
+/// Prints to standard error, as `eprint!` does; for [`errln!`](crate::errln). There is nowhere to tell that it was lost.
+pub fn print_error(text: Arguments<'_>) {
+    // One write a line, so that lines of several programs do not mix.
+    let _ = io::stderr().write_all(text.to_string().as_bytes());
+}
+
+/// Whether all that was printed has arrived, or nobody wanted it any more; to be asked at the end of a program.
+///
+/// # Errors
+/// The first one of writing, but for a pipe that was closed.
+pub fn finish() -> io::Result<()> {
+    match LOST.load(Ordering::Relaxed) {
+        0 => Ok(()),
+        -1 => Err(io::Error::other("writing failed")),
+        number => Err(io::Error::from_raw_os_error(number)),
+    }
+}
+
+/// `print!` that never panics.
+#[macro_export]
+macro_rules! out {
+    ($($text:tt)*) => { $crate::terminal::print(::std::format_args!($($text)*)) };
+}
+
+/// `println!` that never panics.
+#[macro_export]
+macro_rules! outln {
+    () => { $crate::out!("\n") };
+    ($($text:tt)*) => { $crate::terminal::print(::std::format_args!("{}\n", ::std::format_args!($($text)*))) };
+}
+
+/// `eprintln!` that never panics.
+#[macro_export]
+macro_rules! errln {
+    ($($text:tt)*) => {
+        $crate::terminal::print_error(::std::format_args!("{}\n", ::std::format_args!($($text)*)))
+    };
+}
+
+/// Time between two lines of a program that works where no terminal shows a bar.
+pub const LINE_EVERY: Duration = Duration::from_secs(10);
+
+/// Says on standard error every so often how far a long work is, until it is dropped: for where no terminal shows a bar.
+#[derive(Debug)]
+pub struct Heartbeat {
+    end: Option<Sender<()>>,
+    thread: Option<JoinHandle<()>>,
+}
+
+impl Heartbeat {
+    /// Says what `line` gives, if anything, each time that `every` has gone by.
+    #[must_use]
+    pub fn start(every: Duration, line: impl Fn() -> Option<String> + Send + 'static) -> Self {
+        let (end, ended) = channel::<()>();
+        let work = move || {
+            while ended.recv_timeout(every) == Err(RecvTimeoutError::Timeout) {
+                if let Some(line) = line() {
+                    crate::errln!("{line}");
+                }
+            }
+        };
+        // Without a thread there is no line; the work goes on.
+        let thread = std::thread::Builder::new().name("heartbeat".into()).spawn(work).ok();
+        Self { end: Some(end), thread }
+    }
+}
+
+impl Drop for Heartbeat {
+    fn drop(&mut self) {
+        self.end = None;
+        if let Some(thread) = self.thread.take() {
+            // It has nothing to tell, also where it has panicked.
+            let _ = thread.join();
+        }
+    }
+}
+
+/// `done` of `all` units of a work after so much time: how many, how fast, and how long it will take still.
+#[must_use]
+pub fn progress_line(what: &str, done: u64, all: Option<u64>, unit: &str, time: Duration) -> String {
+    let per_s = done as f64 / time.as_secs_f64().max(1e-9);
+    let begin = if what.is_empty() { String::new() } else { format!("{what}: ") };
+    let rate = if per_s >= 1.0 || done == 0 {
+        format!("{per_s:.1} a second")
+    } else {
+        format!("{:.1} s each", 1.0 / per_s)
+    };
+    match all {
+        Some(all) if done > 0 => {
+            let left_s = all.saturating_sub(done) as f64 / per_s;
+            format!("{begin}{done} of {all} {unit}, {rate}, ETA {}", duration(left_s))
+        }
+        Some(all) => format!("{begin}{done} of {all} {unit} after {}", duration(time.as_secs_f64())),
+        None => format!("{begin}{done} {unit}, {rate}"),
+    }
+}
+
+/// Seconds as people say them: `42 s`, `3 min`, `5.2 h`.
+fn duration(seconds: f64) -> String {
+    match seconds {
+        s if s < 120.0 => format!("{s:.0} s"),
+        s if s < 7200.0 => format!("{:.0} min", s / 60.0),
+        s => format!("{:.1} h", s / 3600.0),
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_line_of_progress_tells_how_far_how_fast_and_how_long() {
+        let line = |done, all, s| progress_line("measuring", done, all, "ticks", Duration::from_secs(s));
+        assert_eq!(line(50, Some(200), 25), "measuring: 50 of 200 ticks, 2.0 a second, ETA 75 s");
+        assert_eq!(line(5, Some(200), 50), "measuring: 5 of 200 ticks, 10.0 s each, ETA 32 min");
+        assert_eq!(line(0, Some(200), 30), "measuring: 0 of 200 ticks after 30 s");
+        assert_eq!(line(50, None, 25), "measuring: 50 ticks, 2.0 a second");
+    }
+
+    #[test]
+    fn a_heartbeat_speaks_until_it_is_dropped() {
+        let count = std::sync::Arc::new(std::sync::atomic::AtomicU64::new(0));
+        let seen = std::sync::Arc::clone(&count);
+        let heartbeat = Heartbeat::start(Duration::from_millis(1), move || {
+            seen.fetch_add(1, Ordering::Relaxed);
+            None
+        });
+        while count.load(Ordering::Relaxed) < 3 {
+            std::thread::yield_now();
+        }
+        drop(heartbeat);
+        let after = count.load(Ordering::Relaxed);
+        std::thread::sleep(Duration::from_millis(20));
+        assert_eq!(count.load(Ordering::Relaxed), after);
+    }
+}
