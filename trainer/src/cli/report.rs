@@ -13,7 +13,7 @@ use rcwm_trainer::evaluation::{
 };
 use rcwm_trainer::replay::Folder;
 use rcwm_trainer::report::{
-    AttentionPart, Dynamics, Made, Policy, Report, ReportError, Results, Store, Subject, Success,
+    AttentionPart, Dynamics, Learning, Made, Policy, Report, ReportError, Results, Store, Subject, Success,
     UNDISTURBED, policies, shown_path,
 };
 
@@ -33,6 +33,10 @@ pub struct ReportArguments {
     /// What evaluate --task ... --json wrote, once a seed, for example "rcwm, pre-trained=runs/a.json" (repeatable)
     #[arg(long, value_name = "LABEL=FILE", requires = "report", value_parser = labelled)]
     results: Vec<(String, PathBuf)>,
+    /// Folder of a run of finetune or train that was evaluated while it learned, once a seed, for example "rcwm, pre-trained=runs/a"
+    /// (repeatable)
+    #[arg(long, value_name = "LABEL=DIR", requires = "report", value_parser = labelled)]
+    runs: Vec<(String, PathBuf)>,
 }
 
 fn labelled(text: &str) -> Result<(String, PathBuf), String> {
@@ -109,6 +113,7 @@ struct TaskData {
 impl Work<'_> {
     fn measure(&mut self) -> Result<()> {
         self.results()?;
+        self.learning()?;
         // The fast ones first.
         self.models()?;
         self.policies()
@@ -125,6 +130,15 @@ impl Work<'_> {
         let (source, results) = Results::read(&self.inputs.arguments.results)?;
         let draft = self.store.draft::<Results>(&source)?;
         Ok(self.store.keep(draft, source, results, self.made(), 0.0)?)
+    }
+
+    fn learning(&mut self) -> Result<()> {
+        if self.inputs.arguments.runs.is_empty() {
+            return Ok(());
+        }
+        let (source, learning) = Learning::read(&self.inputs.arguments.runs)?;
+        let draft = self.store.draft::<Learning>(&source)?;
+        Ok(self.store.keep(draft, source, learning, self.made(), 0.0)?)
     }
 
     fn policies(&mut self) -> Result<()> {

@@ -11,12 +11,14 @@
 //! | `success` | a policy in closed loop |
 //! | `dynamics` | a model on recorded trajectories, and its attention |
 //! | `results` | result files that were measured elsewhere |
+//! | `learning` | runs that were evaluated while they learned |
 //! | `page` | the page and `report.json` |
 //! | `sections` | what stands on the page |
 //! | `html` | pictures, tables and intervals in HTML |
 
 mod dynamics;
 mod html;
+mod learning;
 mod made;
 mod page;
 mod parts;
@@ -25,6 +27,7 @@ mod sections;
 mod success;
 
 pub use dynamics::{AttentionPart, AttentionSource, Dynamics, DynamicsSource, Subject, UNDISTURBED};
+pub use learning::{Learning, LearningCurve, LearningPoint, LearningRun, LearningSource};
 pub use made::{Made, shown_path, shown_words};
 pub use page::Report;
 pub use parts::{Draft, Measurement, Part, Store};
@@ -88,6 +91,14 @@ pub enum ReportError {
     #[error("--results {path}: {reason}")]
     Results {
         /// The file.
+        path: PathBuf,
+        /// What is wrong.
+        reason: String,
+    },
+    /// A run cannot be taken.
+    #[error("--runs {path}: {reason}")]
+    Run {
+        /// Its folder.
         path: PathBuf,
         /// What is wrong.
         reason: String,

@@ -6,7 +6,10 @@ use rcwm_models::settings::ModelKind;
 use serde::Serialize;
 
 use super::results::Pooled;
-use super::{AttentionPart, Dynamics, Made, Part, ReportError, Results, Store, Success, html, sections};
+use super::{
+    AttentionPart, Dynamics, Learning, LearningCurve, Made, Part, ReportError, Results, Store, Success, html,
+    sections,
+};
 use crate::evaluation::Comparison;
 
 /// Version of `report.json`.
@@ -36,6 +39,10 @@ pub struct Report {
     pub results: Vec<Part<Results>>,
     /// The same, by label.
     pub pooled: Vec<Pooled>,
+    /// Runs that were evaluated while they learned.
+    pub learning: Vec<Part<Learning>>,
+    /// The same, by label.
+    pub learning_curves: Vec<LearningCurve>,
     #[serde(skip)]
     pub(super) store: Store,
 }
@@ -62,6 +69,7 @@ impl Report {
         dynamics
             .sort_by_key(|part| (part.source.task.clone(), part.source.disturb.clone(), is_baseline(part)));
         let results: Vec<Part<Results>> = store.all()?;
+        let learning: Vec<Part<Learning>> = store.all()?;
         Ok(Self {
             format: FORMAT,
             made,
@@ -72,6 +80,8 @@ impl Report {
             attention: store.all()?,
             pooled: results.iter().flat_map(|part| part.measured.pooled()).collect(),
             results,
+            learning_curves: learning.iter().flat_map(|part| part.measured.curves()).collect(),
+            learning,
             store: store.clone(),
         })
     }

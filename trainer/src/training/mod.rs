@@ -69,7 +69,7 @@ pub use phases::{FewshotSettings, FinetuneSettings, Phase};
 pub use prefill::{Prefilled, episodes_folder, prefill};
 pub use pretrain::{Outcome, Pretraining, Progress};
 pub use reset::{Reset, ResetSettings, start_from};
-pub use run::{Best, Run};
+pub use run::{Best, METRICS_BYTES_MAX, Run};
 pub use settings::{PretrainSettings, ReplaySettings, TrainingSettings};
 pub use state::{StateError, TrainingState};
 

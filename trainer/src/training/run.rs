@@ -21,7 +21,7 @@ const SETTINGS_FILE: &str = "settings.toml";
 const METRICS_FILE: &str = "metrics.jsonl";
 const CURVES_FILE: &str = "curves.png";
 /// Largest file of metrics that is read back, in bytes.
-pub(super) const METRICS_BYTES_MAX: u64 = 1 << 30;
+pub const METRICS_BYTES_MAX: u64 = 1 << 30;
 
 /// A run's folder.
 #[derive(Debug)]
@@ -199,6 +199,12 @@ impl Run {
             return Err(TrainingError::NothingToResume { path: folder.to_path_buf(), file: SETTINGS_FILE });
         }
         Ok(rcwm_models::settings::read(&path)?)
+    }
+
+    /// A run's metrics, one JSON object a line.
+    #[must_use]
+    pub fn metrics(folder: &Path) -> PathBuf {
+        folder.join(METRICS_FILE)
     }
 
     /// The run's newest checkpoint.

@@ -3,6 +3,7 @@
 mod attention;
 mod disturbances;
 mod dynamics;
+mod learning;
 mod made;
 mod results;
 mod success;
@@ -37,6 +38,7 @@ pub(super) fn all(report: &Report) -> Result<Vec<Section>, ReportError> {
         section("attention", "Attention", attention::section(report)?),
         section("disturbances", "Disturbances", disturbances::section(report)?),
         section("comparison", "Comparison of policies", results::section(report)),
+        section("learning", "Learning curves", learning::section(report)?),
         section("made", "How it was made", made::section(report)),
     ])
 }
