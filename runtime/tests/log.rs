@@ -14,7 +14,7 @@ use rcwm_models::episode::Episode;
 use rcwm_models::wire::clock::monotonic_ns;
 use rcwm_models::wire::{Action, ActionSource, Observation, ObservationFlags, SimulatorLink, Wait};
 use rcwm_runtime::controller::{
-    ControllerSettings, Counters, EpisodeResult, Fallback, State, Tick, TickObserver, TickTimes,
+    ControllerSettings, Counters, EpisodeResult, Episodes, Fallback, State, Tick, TickObserver, TickTimes,
 };
 use rcwm_runtime::log::{Answers, Entry, LogReader, LogSettings, LogSummary, Logger, ReplayReport, Replayer};
 use rcwm_runtime::policy::{CallOutcome, Sampling};
@@ -383,7 +383,7 @@ impl CallLog {
             policy,
             telemetry: &telemetry,
             counters: &counters,
-            episodes: &[],
+            episodes: &Episodes::default(),
             running: EpisodeResult::start(&observation),
         });
     }

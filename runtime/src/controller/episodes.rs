@@ -17,9 +17,9 @@ pub struct Episodes {
     return_sum: f64,
 }
 
-impl Episodes {
+impl Default for Episodes {
     /// None so far; memory for all that are kept is there.
-    pub(super) fn new() -> Self {
+    fn default() -> Self {
         Self {
             last: VecDeque::with_capacity(EPISODES_KEPT),
             ended: 0,
@@ -28,7 +28,9 @@ impl Episodes {
             return_sum: 0.0,
         }
     }
+}
 
+impl Episodes {
     pub(super) fn push(&mut self, episode: EpisodeResult) {
         self.ended += 1;
         if episode.whole {
@@ -81,7 +83,7 @@ mod tests {
 
     #[test]
     fn all_are_counted_the_last_are_kept_and_memory_stays() {
-        let mut episodes = Episodes::new();
+        let mut episodes = Episodes::default();
         let capacity = episodes.last.capacity();
         let count = 3 * EPISODES_KEPT as u64;
         for number in 0..count {

@@ -159,7 +159,7 @@ impl Controller {
             telemetry: Telemetry::new(),
             surprise: SurpriseTelemetry::new(),
             counters: Counters::default(),
-            episodes: Episodes::new(),
+            episodes: Episodes::default(),
             running: None,
             whole_episodes: 0,
             pace: None,
