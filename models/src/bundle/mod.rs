@@ -24,7 +24,7 @@ mod manifest;
 pub use graph::GraphError;
 pub use load::{Bundle, BundleError, InitialState};
 pub use manifest::{
-    Control, DType, FORMAT, FileEntry, Manifest, PartEntry, PartName, Provenance, TensorSpec,
+    ActionMode, Control, DType, FORMAT, FileEntry, Manifest, PartEntry, PartName, Provenance, TensorSpec,
 };
 
 /// File name of the manifest.

@@ -250,7 +250,7 @@ impl EpisodeBuilder {
     ///
     /// # Errors
     /// [`EpisodeError::Order`] when the episode was already over, begins again in its middle, grows beyond
-    /// [`STEPS_MAX`], or the observation holds a number that is not finite.
+    /// [`STEPS_MAX`], or the observation is not [valid](Observation::is_valid).
     pub fn push(&mut self, observation: &Observation) -> Result<(), EpisodeError> {
         let flags = ObservationFlags(observation.flags);
         let refuse = |reason: &str| {
@@ -268,6 +268,9 @@ impl EpisodeBuilder {
         }
         if !observation.is_finite() {
             return refuse("a number is not finite");
+        }
+        if !observation.has_executable_action() {
+            return refuse("the executed action is out of [-1, 1]");
         }
         self.image.extend_from_slice(&observation.image);
         self.action.extend_from_slice(&observation.executed_action);

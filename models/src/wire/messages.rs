@@ -4,6 +4,11 @@ use iceoryx2::prelude::ZeroCopySend;
 
 use crate::{ACTION_LEN, IMAGE_BYTES, MASK_BYTES, PROPRIOCEPTION_LEN};
 
+/// Largest value of any component of an action, either way.
+pub const ACTION_MAX: f32 = 1.0;
+/// How far beyond [`ACTION_MAX`] a robot may report what it executed: it may have rounded.
+const ACTION_ROUNDING: f32 = 1e-3;
+
 /// Facts about an observation, as bits of [`Observation::flags`].
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
 pub struct ObservationFlags(pub u32);
@@ -19,7 +24,7 @@ impl ObservationFlags {
     pub const SUCCESS: Self = Self(1 << 3);
     /// [`Observation::robot_mask`] holds a mask.
     pub const MASK_VALID: Self = Self(1 << 4);
-    /// No answer had come in time: the executed action is the previous one, held.
+    /// No answer had come in time: the executed action is the previous one, held, or rest where nobody steers any more.
     pub const ACTION_HELD: Self = Self(1 << 5);
     /// The same observation (same sequence) was published before; it is sent again for a new or silent controller.
     pub const REPEATED: Self = Self(1 << 6);
@@ -64,7 +69,8 @@ pub struct Observation {
     pub task: u32,
     /// Reward of the transition that led here; 0 at the first of an episode.
     pub reward: f32,
-    /// The action that led here, as executed; zeros at the first of an episode.
+    /// The action that led here, as executed; each in [-1, 1]. At the first of an episode zeros, or, where actions are absolute
+    /// positions, the one that the robot holds.
     pub executed_action: [f32; ACTION_LEN],
     /// 9 normalised joint positions, then 9 joint velocities.
     pub proprioception: [f32; PROPRIOCEPTION_LEN],
@@ -101,7 +107,20 @@ impl Observation {
         ObservationFlags(self.flags).contains(flag)
     }
 
-    /// Whether every number in it is finite; nothing else may reach a policy.
+    /// Whether the executed action is one that a robot can have executed: every component finite and, but for rounding, in [-1, 1].
+    #[must_use]
+    pub fn has_executable_action(&self) -> bool {
+        // NaN is not less than anything.
+        self.executed_action.iter().all(|x| x.abs() <= ACTION_MAX + ACTION_ROUNDING)
+    }
+
+    /// Whether every number in it is finite and the executed action in range; nothing else may reach a policy.
+    #[must_use]
+    pub fn is_valid(&self) -> bool {
+        self.is_finite() && self.has_executable_action()
+    }
+
+    /// Whether every number in it is finite.
     #[must_use]
     pub fn is_finite(&self) -> bool {
         self.reward.is_finite()
@@ -183,6 +202,17 @@ mod tests {
         let mut observation = Observation::zeroed();
         assert!(observation.is_finite());
         observation.proprioception[17] = f32::NAN;
-        assert!(!observation.is_finite());
+        assert!(!observation.is_finite() && !observation.is_valid());
+    }
+
+    #[test]
+    fn an_executed_action_out_of_range_makes_an_observation_invalid() {
+        let mut observation = Observation::zeroed();
+        for (executed, valid) in
+            [(-1.0, true), (1.0 + f32::EPSILON, true), (1.1, false), (-3e38, false), (f32::NAN, false)]
+        {
+            observation.executed_action[2] = executed;
+            assert_eq!(observation.is_valid(), valid, "{executed}");
+        }
     }
 }

@@ -23,4 +23,4 @@ pub use link::{
     ActionObserverLink, ControllerLink, Events, LinkError, LinkSettings, ObservationSample, ObservationSlot,
     ObserverLink, SimulatorLink, Wait, forget_prefix, list_leftovers,
 };
-pub use messages::{Action, ActionSource, Observation, ObservationFlags};
+pub use messages::{ACTION_MAX, Action, ActionSource, Observation, ObservationFlags};

@@ -7,7 +7,7 @@ use std::path::{Path, PathBuf};
 use ndarray::{ArrayD, IxDyn};
 use rcwm_models::ACTION_LEN;
 use rcwm_models::bundle::{
-    Bundle, Control, FORMAT, FileEntry, InitialState, MANIFEST_FILE, Manifest, PartEntry, PartName,
+    ActionMode, Bundle, Control, FORMAT, FileEntry, InitialState, MANIFEST_FILE, Manifest, PartEntry, PartName,
     Provenance,
 };
 use rcwm_models::files::{sha256_hex, write_atomic};
@@ -95,6 +95,7 @@ pub fn write(
             rate_hz: options.rate_hz,
             action_low: [-1.0; ACTION_LEN],
             action_high: [1.0; ACTION_LEN],
+            action_mode: ActionMode::default(),
         },
         provenance: provenance(checkpoint, options, &scene),
         initial,

@@ -1,5 +1,6 @@
 //! The controller's end.
 
+use std::cell::Cell;
 use std::time::Duration;
 
 use iceoryx2::prelude::Node;
@@ -14,11 +15,13 @@ use crate::wire::{Action, Observation};
 /// An observation received in shared memory; it stays valid while this is held.
 pub type ObservationSample = Received<Observation>;
 
-/// The controller's end: receives observations, publishes actions.
+/// The controller's end: receives observations, publishes actions. However it ends, a panic included, the simulator is told.
 pub struct ControllerLink {
     settings: LinkSettings,
     observations: Receiver<Observation>,
     actions: Sender<Action>,
+    /// The simulator was told that no further action will come.
+    said_closed: Cell<bool>,
     // Dropped last: the ports above belong to it.
     node: Node<Ipc>,
 }
@@ -35,7 +38,7 @@ impl ControllerLink {
         let action = Direction::<Action>::open(&node, &settings.instance, "action")?;
         let observations = observation.receiver()?;
         let actions = action.sender("controller")?;
-        let link = Self { settings, observations, actions, node };
+        let link = Self { settings, observations, actions, said_closed: Cell::new(false), node };
         link.hello()?;
         Ok(link)
     }
@@ -81,6 +84,7 @@ impl ControllerLink {
     /// # Errors
     /// [`LinkError::Traffic`].
     pub fn send(&self, mut action: Action) -> Result<u64, LinkError> {
+        self.said_closed.set(false);
         action.published_ns = monotonic_ns();
         let sample = self.actions.publisher.loan_uninit().map_err(traffic("loaning an action"))?;
         sample.write_payload(action).send().map_err(traffic("publishing an action"))?;
@@ -93,11 +97,30 @@ impl ControllerLink {
         self.node.try_cleanup_dead_nodes();
     }
 
-    /// Tells the simulator that no further action will come.
+    /// Tells the simulator that no further action will come; once told, it is not told again.
+    ///
+    /// # Errors
+    /// [`LinkError::Traffic`]; dropping the link then tries once more.
+    pub fn say_closed(&self) -> Result<(), LinkError> {
+        if !self.said_closed.get() {
+            self.actions.notify(EVENT_CLOSED)?;
+            self.said_closed.set(true);
+        }
+        Ok(())
+    }
+
+    /// Tells the simulator that no further action will come, and leaves.
     ///
     /// # Errors
     /// [`LinkError::Traffic`].
     pub fn close(self) -> Result<(), LinkError> {
-        self.actions.notify(EVENT_CLOSED)
+        self.say_closed()
+    }
+}
+
+impl Drop for ControllerLink {
+    fn drop(&mut self) {
+        // Nobody is left to hear of an error.
+        let _ = self.say_closed();
     }
 }
