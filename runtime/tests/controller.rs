@@ -83,8 +83,10 @@ fn an_output_that_is_not_finite_never_reaches_the_wire() {
         let peer = link.peer();
         let controller = start_controller(bundle.path(), &link, Fallback::Hold);
         for sequence in 0..3 {
-            let action = ask(&peer, &observation(sequence, sequence as u32));
-            assert_eq!((action.source, action.action), (ActionSource::Fallback as u32, [0.0; 4]), "{part}");
+            let sent = observation(sequence, sequence as u32);
+            let action = ask(&peer, &sent);
+            let held = (ActionSource::Fallback as u32, sent.executed_action);
+            assert_eq!((action.source, action.action), held, "{part}");
         }
         peer.close().unwrap();
         let counters = controller.join().unwrap().counters;

@@ -211,6 +211,7 @@ fn the_rate_limit_holds_between_any_two_actions_on_the_wire() {
     for sequence in 0..20 {
         let mut sent = observation(sequence, sequence as u32);
         sent.reward = if sequence % 5 == 4 { f32::NAN } else { 0.0 };
+        sent.executed_action = last;
         let answer = ask(&peer, &sent).action;
         assert!(
             answer.iter().zip(last).all(|(a, b)| (a - b).abs() <= 0.01 + 1e-6),

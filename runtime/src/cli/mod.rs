@@ -56,7 +56,7 @@ impl From<&anyhow::Error> for Exit {
             Some(ControllerError::NoObservation { .. }) => Self::NoObservation,
             Some(ControllerError::Stopped { .. }) => Self::Stopped,
             Some(ControllerError::PeerLost { .. }) => Self::PeerLost,
-            Some(ControllerError::Link(_)) | None => Self::Error,
+            Some(_) | None => Self::Error,
         }
     }
 }

@@ -110,13 +110,18 @@ impl Observers {
 
     /// Waits until everything is written. What could not be written keeps nothing else from being told.
     pub(super) fn finish(self) -> (Left, Vec<anyhow::Error>) {
-        let bar = indicatif::ProgressBar::new_spinner().with_message("writing what was recorded");
-        bar.enable_steady_tick(Duration::from_millis(200));
+        let writes = self.recorder.is_some() || self.logger.is_some() || self.snapshots.is_some();
+        // Where nothing is left to write, a terminal is not waited for either.
+        let bar = writes.then(|| {
+            let bar = indicatif::ProgressBar::new_spinner().with_message("writing what was recorded");
+            bar.enable_steady_tick(Duration::from_millis(200));
+            bar
+        });
         let mut failures = Vec::new();
         let log = self.logger.and_then(|logger| note(logger.finish(), &mut failures));
         self.snapshots.and_then(|snapshots| note(snapshots.finish(), &mut failures));
         let recorded = self.recorder.and_then(|recorder| note(recorder.finish(), &mut failures));
-        bar.finish_and_clear();
+        bar.inspect(indicatif::ProgressBar::finish_and_clear);
         (Left { log, recorded: recorded.unwrap_or_default() }, failures)
     }
 }

@@ -97,15 +97,23 @@ pub(super) fn run(arguments: &RunArguments) -> anyhow::Result<()> {
     }
     let mut status = StatusLine::start(&arguments.instance).context("starting the status line")?;
     // Asked for last: the other threads stay ordinary ones.
-    let granted = arguments.time.ask()?;
+    let granted = match arguments.time.ask() {
+        Ok(granted) => granted,
+        Err(error) => {
+            // Whatever ends the run, the robot is told before a terminal is waited for.
+            controller.close()?;
+            return Err(error);
+        }
+    };
     let result = control(&mut controller, &mut status, &mut observers, &stop);
+    // The robot has been told: what follows may take its time, or wait for a terminal.
+    let closed = controller.close();
     drop(status);
     let ended = result.as_ref().map_or_else(Ended::from, |ended| *ended);
     let mut report = controller.report(arguments.engine, ended);
     report.realtime = granted;
     let telemetry = controller.telemetry().clone();
-    // The simulator is told before anything slow is done.
-    let closed = controller.close();
+    drop(controller);
     report.frames_dropped = observers.frames_dropped();
     let (left, unwritten) = observers.finish();
     // How the run ended comes first: it decides the exit code.

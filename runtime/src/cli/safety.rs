@@ -13,7 +13,8 @@ use crate::realtime::{self, Granted, Request};
 #[derive(Debug, Args)]
 #[command(next_help_heading = "When things go wrong")]
 pub(super) struct SafetyArguments {
-    /// What is sent when the policy has nothing fit to send: hold (the last action), zero, or four numbers
+    /// What is sent when the policy has nothing fit to send: hold (the action executed last), zero (no motion, where actions are
+    /// displacements or velocities; refused where they are positions), or four numbers
     #[arg(
         long,
         value_name = "hold|zero|A,B,C,D",
@@ -43,7 +44,7 @@ pub(super) struct SafetyArguments {
     /// The same for the environment branch ("the scene has changed")
     #[arg(long, value_name = "NATS", value_parser = at_least_zero)]
     surprise_environment_max: Option<f32>,
-    /// Largest change of any component of the action from one action to the next
+    /// Largest change of any component of the action from what was executed last; the bundle's limits hold before it
     #[arg(long, value_name = "CHANGE", value_parser = at_least_zero)]
     rate_limit: Option<f32>,
 }

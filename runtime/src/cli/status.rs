@@ -1,6 +1,6 @@
 //! The live line of `run`: drawn by its own thread, so that a slow terminal never holds up a tick.
 
-use std::sync::mpsc::{Receiver, Sender, channel};
+use std::sync::mpsc::{Receiver, SyncSender, sync_channel};
 use std::thread::JoinHandle;
 use std::time::{Duration, Instant};
 
@@ -9,6 +9,10 @@ use crate::telemetry::Stage;
 
 /// Time between two updates of the line.
 const UPDATE: Duration = Duration::from_millis(200);
+/// Messages that wait to be drawn; a terminal that does not drain loses those beyond.
+const WAITING_MAX: usize = 256;
+/// How long the end of a run waits for a terminal.
+const PATIENCE: Duration = Duration::from_secs(1);
 
 enum Message {
     Status(String),
@@ -17,16 +21,17 @@ enum Message {
 
 /// The loop's end of the live line.
 pub(super) struct StatusLine {
-    messages: Option<Sender<Message>>,
+    messages: Option<SyncSender<Message>>,
     thread: Option<JoinHandle<()>>,
     last: Instant,
     last_observations: u64,
     reported: u64,
+    clock_ahead: bool,
 }
 
 impl StatusLine {
     pub(super) fn start(waiting_for: &str) -> std::io::Result<Self> {
-        let (messages, received) = channel();
+        let (messages, received) = sync_channel(WAITING_MAX);
         let waiting = format!("waiting for an observation on instance {waiting_for:?}");
         let thread =
             std::thread::Builder::new().name("status".into()).spawn(move || draw(&received, waiting))?;
@@ -36,13 +41,14 @@ impl StatusLine {
             last: Instant::now(),
             last_observations: 0,
             reported: 0,
+            clock_ahead: false,
         })
     }
 
     fn send(&self, message: Message) {
         if let Some(messages) = &self.messages {
-            // If the drawing thread is gone there is nothing left to draw on.
-            let _ = messages.send(message);
+            // If the drawing thread is gone or held up there is nothing to draw on.
+            let _ = messages.try_send(message);
         }
     }
 
@@ -71,6 +77,10 @@ impl TickObserver for StatusLine {
             self.send(Message::Line(episode.line()));
         }
         self.reported = tick.episodes.ended();
+        if tick.counters.clock_ahead > 0 && !std::mem::replace(&mut self.clock_ahead, true) {
+            let said = "the robot's clock is ahead of this machine's CLOCK_MONOTONIC: its times are taken as those of receiving";
+            self.send(Message::Line(said.into()));
+        }
         if self.last.elapsed() >= UPDATE {
             let status = self.status(tick);
             self.send(Message::Status(status));
@@ -82,8 +92,13 @@ impl TickObserver for StatusLine {
 impl Drop for StatusLine {
     fn drop(&mut self) {
         self.messages = None;
-        if let Some(thread) = self.thread.take() {
-            // A thread that panicked while drawing has nothing left to clear.
+        let Some(thread) = self.thread.take() else { return };
+        let start = Instant::now();
+        while !thread.is_finished() && start.elapsed() < PATIENCE {
+            std::thread::sleep(Duration::from_millis(2));
+        }
+        // One that a terminal holds up ends with the process. One that panicked while drawing has nothing left to clear.
+        if thread.is_finished() {
             let _ = thread.join();
         }
     }

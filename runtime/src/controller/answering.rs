@@ -8,9 +8,19 @@ use super::{
     Arrival, Cause, Controller, ControllerError, EpisodeResult, Event, Response, State, Taken, Tick,
     TickObserver, TickTimes, step,
 };
+use crate::pacing::Stamps;
 use crate::policy::{Decision, PolicyError};
 use crate::swap::Moment;
 use crate::telemetry::Stage;
+
+/// What to send, and where it comes from; no action where nothing is known that could be held.
+type Chosen = (ActionSource, Option<[f32; ACTION_LEN]>);
+
+/// An answer that stays here.
+fn unsent(sequence: u64, source: ActionSource, action: Option<[f32; ACTION_LEN]>) -> Action {
+    let action = action.unwrap_or_default();
+    Action { answers: sequence, published_ns: 0, source: source as u32, reserved: 0, action }
+}
 
 /// A tick on its way to the observers.
 struct Ticked<'a> {
@@ -32,6 +42,7 @@ impl Controller {
     ) -> Result<Taken, ControllerError> {
         let received_ns = monotonic_ns();
         let observation: &Observation = sample.payload();
+        self.counters.clock_ahead += u64::from(Stamps::of(observation, received_ns).ahead_ns > 0);
         if self.pacing.is_stale(observation, received_ns) {
             self.counters.note(Arrival::Stale);
             return Ok(Taken::Nothing);
@@ -40,7 +51,7 @@ impl Controller {
         self.counters.note(arrival);
         match arrival {
             Arrival::Stale => Ok(Taken::Nothing),
-            Arrival::Repeated => self.answer_again(observation),
+            Arrival::Repeated => self.answer_again(observation, received_ns),
             Arrival::Joined { .. } => self.answer_new(observation, true, received_ns, observers),
             Arrival::Next { new_episode, .. } => {
                 let is_first = new_episode || observation.is(ObservationFlags::FIRST);
@@ -51,7 +62,11 @@ impl Controller {
 
     /// Answers the last observation as before. One that is marked as repeated says that the peer still stands there, whatever was
     /// imagined since: our answer was lost, or overwritten by one to a tick that the peer has not reached.
-    fn answer_again(&mut self, observation: &Observation) -> Result<Taken, ControllerError> {
+    fn answer_again(
+        &mut self,
+        observation: &Observation,
+        received_ns: u64,
+    ) -> Result<Taken, ControllerError> {
         let sequence = observation.sequence;
         let Some(own) = self.own_answer.filter(|own| own.answers == sequence) else {
             return Ok(Taken::Again);
@@ -62,16 +77,17 @@ impl Controller {
         }
         if went_on {
             self.rewind(sequence.saturating_add(1), false);
+            self.gate.observed(observation, false);
         }
         let source = ActionSource::from_wire(own.source).unwrap_or(ActionSource::Fallback);
         if source == ActionSource::Policy {
             self.state = step(self.state, Event::Decided, self.settings.ticks).0;
         }
-        self.pacing.observed(observation);
-        if self.is_overtaken(observation)? {
+        self.pacing.observed(observation, received_ns);
+        if self.is_overtaken(observation, received_ns)? {
             return Ok(Taken::Again);
         }
-        let answer = self.send(sequence, source, own.action)?;
+        let answer = self.send(sequence, source, Some(own.action))?;
         if went_on {
             self.work_ahead((!observation.is(ObservationFlags::LAST)).then_some(&answer.action));
         }
@@ -88,32 +104,29 @@ impl Controller {
         let unanswered = self.unanswered(observation, is_first);
         if is_first {
             self.answer = None;
-            self.gate.start_episode();
             // Here only where the last episode was cut: else it happened in the idle time after its end.
             self.swap(Moment::BetweenEpisodes);
         }
+        self.gate.observed(observation, is_first);
         let rewound = self.rewind(observation.sequence, is_first);
         let (decision, event) = self.decide(observation, is_first);
         let (source, action) = self.respond(event, decision.as_ref())?;
-        self.pacing.observed(observation);
-        let overtaken = self.is_overtaken(observation)?;
+        self.pacing.observed(observation, received_ns);
+        let overtaken = self.is_overtaken(observation, received_ns)?;
         let answer = self.send_unless(overtaken, observation.sequence, source, action)?;
-        self.own_answer = (!overtaken).then_some(answer);
-        let times = TickTimes {
-            scheduled_ns: observation.scheduled_ns,
-            published_ns: observation.published_ns,
-            received_ns,
-            sent_ns: answer.published_ns,
-        };
+        let sent = answer.published_ns > 0;
+        self.own_answer = sent.then_some(answer);
+        let Stamps { scheduled_ns, published_ns, .. } = Stamps::of(observation, received_ns);
+        let times = TickTimes { scheduled_ns, published_ns, received_ns, sent_ns: answer.published_ns };
         self.record_times(observation, &times, unanswered);
         self.count_episode(observation, is_first);
         let observed = Some(observation);
         self.show(
-            &Ticked { observation: observed, is_first, rewound, decision, answer, overtaken, times },
+            &Ticked { observation: observed, is_first, rewound, decision, answer, overtaken: !sent, times },
             observers,
         );
         self.finish_episode(observation);
-        if !overtaken {
+        if sent {
             // Here the idle time begins.
             let is_last = observation.is(ObservationFlags::LAST);
             self.swap(if is_last { Moment::BetweenEpisodes } else { Moment::InEpisode });
@@ -136,7 +149,7 @@ impl Controller {
 
     /// The policy's decision, and whether it is fit to be sent.
     fn decide(&mut self, observation: &Observation, is_first: bool) -> (Option<Decision>, Event) {
-        if !observation.is_finite() {
+        if !observation.is_valid() {
             self.counters.refused_observations += 1;
             return (None, Event::Unfit(Cause::Observation));
         }
@@ -178,22 +191,21 @@ impl Controller {
     }
 
     /// What to send after an event.
-    fn respond(
-        &mut self,
-        event: Event,
-        decision: Option<&Decision>,
-    ) -> Result<(ActionSource, [f32; ACTION_LEN]), ControllerError> {
+    fn respond(&mut self, event: Event, decision: Option<&Decision>) -> Result<Chosen, ControllerError> {
         let (state, response) = step(self.state, event, self.settings.ticks);
         self.state = state;
         if let State::Stopped { cause } = state {
             return Err(ControllerError::Stopped { cause, ticks: self.settings.ticks.fallback_ticks_max });
         }
-        let fallback = (ActionSource::Fallback, self.settings.fallback.action(self.gate.last()));
         Ok(match (response, decision) {
-            (Response::Policy, Some(decision)) => (ActionSource::Policy, decision.action),
-            (Response::Imagine, Some(decision)) => (ActionSource::Imagined, decision.action),
-            _ => fallback,
+            (Response::Policy, Some(decision)) => (ActionSource::Policy, Some(decision.action)),
+            (Response::Imagine, Some(decision)) => (ActionSource::Imagined, Some(decision.action)),
+            _ => self.fallback(),
         })
+    }
+
+    fn fallback(&self) -> Chosen {
+        (ActionSource::Fallback, self.gate.fallback(self.settings.fallback))
     }
 
     /// Answers a tick whose observation has not come.
@@ -207,18 +219,16 @@ impl Controller {
         self.state = state;
         let (decision, (source, action)) = match response {
             Response::Imagine => self.imagine(missing.sequence)?,
-            Response::Fallback => {
-                (None, (ActionSource::Fallback, self.settings.fallback.action(self.gate.last())))
-            }
+            Response::Fallback => (None, self.fallback()),
             Response::Policy | Response::Nothing => {
                 self.counters.peers_lost += 1;
                 self.pacing.rest();
                 return Ok(());
             }
         };
-        // Whatever has come by now is worth more than an answer without it.
+        // What has come by now is worth more than an answer without it, if it will be answered itself.
         self.newer = self.link.poll_observation()?;
-        let overtaken = self.newer.is_some();
+        let overtaken = self.newer.as_ref().is_some_and(|newer| self.will_answer(newer));
         let answer = self.send_unless(overtaken, missing.sequence, source, action)?;
         let times = TickTimes {
             scheduled_ns: missing.scheduled_ns,
@@ -234,30 +244,26 @@ impl Controller {
                 rewound: false,
                 decision,
                 answer,
-                overtaken,
+                overtaken: answer.published_ns == 0,
                 times,
             },
             observers,
         );
-        if !overtaken {
+        if answer.published_ns > 0 {
             self.work_ahead(Some(&answer.action));
         }
         Ok(())
     }
 
     /// The policy on an imagined frame; the fallback where that fails.
-    #[expect(clippy::type_complexity, reason = "what `respond` gives, and where it comes from")]
-    fn imagine(
-        &mut self,
-        sequence: u64,
-    ) -> Result<(Option<Decision>, (ActionSource, [f32; ACTION_LEN])), ControllerError> {
-        if self.fresh_policy {
-            // It has seen nothing that it could go on from.
-            return Ok((None, (ActionSource::Fallback, self.settings.fallback.action(self.gate.last()))));
-        }
+    fn imagine(&mut self, sequence: u64) -> Result<(Option<Decision>, Chosen), ControllerError> {
+        // Where the policy has just taken over, it has seen nothing that it could go on from.
+        let Some(held) = self.gate.held().filter(|_| !self.fresh_policy) else {
+            return Ok((None, self.fallback()));
+        };
         self.imagined.note(sequence, self.policy.state());
-        match self.policy.imagine(&self.gate.last().unwrap_or_default()) {
-            Ok(decision) => Ok((Some(decision), (ActionSource::Imagined, decision.action))),
+        match self.policy.imagine(&held) {
+            Ok(decision) => Ok((Some(decision), (ActionSource::Imagined, Some(decision.action)))),
             Err(error) => {
                 self.imagined.take_back();
                 let cause = self.count_failure(&error);
@@ -268,13 +274,32 @@ impl Controller {
 
     /// Whether a newer observation has come while this one was worked on: an answer to this one would be stale. Looked for only
     /// where the tick's time is over, so that a tick in time loses none.
-    fn is_overtaken(&mut self, observation: &Observation) -> Result<bool, ControllerError> {
-        let period_ns = observation.period_ns;
-        if period_ns == 0 || monotonic_ns() <= observation.scheduled_ns.saturating_add(period_ns) {
+    fn is_overtaken(&mut self, observation: &Observation, received_ns: u64) -> Result<bool, ControllerError> {
+        let (period_ns, due_ns) = (observation.period_ns, Stamps::of(observation, received_ns).scheduled_ns);
+        if period_ns == 0 || monotonic_ns() <= due_ns.saturating_add(period_ns) {
             return Ok(false);
         }
         self.newer = self.link.poll_observation()?;
-        Ok(self.newer.as_ref().is_some_and(|newer| newer.sequence != observation.sequence))
+        Ok(self.newer.as_ref().is_some_and(|newer| self.arrival(newer, monotonic_ns()).is_new()))
+    }
+
+    /// What an observation is to those before it; one that was due too long ago is stale, whatever its number.
+    fn arrival(&self, sample: &ObservationSample, received_ns: u64) -> Arrival {
+        let observation: &Observation = sample.payload();
+        if self.pacing.is_stale(observation, received_ns) {
+            return Arrival::Stale;
+        }
+        self.tracker.look(sample.origin().value(), observation.sequence, observation.episode)
+    }
+
+    /// Whether an observation that has come will get an answer of its own, however many ticks were answered without it.
+    fn will_answer(&self, sample: &ObservationSample) -> bool {
+        let arrival = self.arrival(sample, monotonic_ns());
+        let again = || {
+            let known = self.own_answer.is_some_and(|own| own.answers == sample.sequence);
+            known && sample.is(ObservationFlags::REPEATED)
+        };
+        arrival.is_new() || (arrival == Arrival::Repeated && again())
     }
 
     /// Sends, or counts that a newer observation has made the answer stale.
@@ -283,23 +308,26 @@ impl Controller {
         overtaken: bool,
         sequence: u64,
         source: ActionSource,
-        action: [f32; ACTION_LEN],
+        action: Option<[f32; ACTION_LEN]>,
     ) -> Result<Action, ControllerError> {
         if !overtaken {
             return self.send(sequence, source, action);
         }
         self.counters.overtaken_answers += 1;
-        Ok(Action { answers: sequence, published_ns: 0, source: source as u32, reserved: 0, action })
+        Ok(unsent(sequence, source, action))
     }
 
-    /// The only way onto the wire.
+    /// The only way onto the wire. Where there is nothing fit to send nor to hold, the robot goes on with what it knows itself.
     fn send(
         &mut self,
         sequence: u64,
         source: ActionSource,
-        action: [f32; ACTION_LEN],
+        action: Option<[f32; ACTION_LEN]>,
     ) -> Result<Action, ControllerError> {
-        let passed = self.gate.pass(action);
+        let Some(passed) = action.and_then(|action| self.gate.pass(action)) else {
+            self.counters.withheld_answers += 1;
+            return Ok(unsent(sequence, ActionSource::Fallback, None));
+        };
         self.counters.non_finite_outputs += u64::from(passed.was_not_finite);
         self.counters.rate_limited += u64::from(passed.rate_limited);
         let source = if passed.was_not_finite { ActionSource::Fallback } else { source };

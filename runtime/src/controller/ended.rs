@@ -21,6 +21,18 @@ pub enum ControllerError {
         /// How long was waited, in s.
         timeout_s: f64,
     },
+    /// The loop panicked: a fault of the program. The simulator was told that no further action will come.
+    #[error(
+        "the controller's loop panicked, and the robot was told that it ends: {0}; this is a fault of the program, please \
+         report it with the command and, if there is one, the log"
+    )]
+    Panicked(String),
+    /// Zeros are no rest for the policy.
+    #[error(
+        "--fallback zero would send the robot to the pose of zeros, for the bundle's actions are absolute positions; use \
+         --fallback hold, or name a pose as four numbers"
+    )]
+    ZeroIsAPose,
     /// The peer was there and has been silent for too long.
     #[error(
         "the peer on instance {instance:?} has been silent for {silence_s} s; look after it, or wait longer with \
@@ -68,7 +80,10 @@ impl From<&ControllerError> for Ended {
         match error {
             ControllerError::PeerLost { .. } => Self::PeerLost,
             ControllerError::Stopped { .. } => Self::Stopped,
-            ControllerError::Link(_) | ControllerError::NoObservation { .. } => Self::Failed,
+            ControllerError::Link(_)
+            | ControllerError::NoObservation { .. }
+            | ControllerError::Panicked(_)
+            | ControllerError::ZeroIsAPose => Self::Failed,
         }
     }
 }

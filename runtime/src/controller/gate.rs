@@ -1,8 +1,10 @@
-//! The last thing that happens to an action, whoever decided it: finite, within the limits, and not too far from the one before.
+//! The last thing that happens to an action, whoever decided it: finite, not too far from what was executed before, and within the limits.
 
 use std::str::FromStr;
 
 use rcwm_models::ACTION_LEN;
+use rcwm_models::bundle::{ActionMode, Control};
+use rcwm_models::wire::{Observation, ObservationFlags};
 use serde::{Deserialize, Serialize};
 
 use crate::policy::ActionLimits;
@@ -11,24 +13,12 @@ use crate::policy::ActionLimits;
 #[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
 #[serde(rename_all = "lowercase")]
 pub enum Fallback {
-    /// The last action that was sent in this episode; zeros before the first.
+    /// The action that the robot executed last, or was sent last if that is later.
     Hold,
-    /// Zeros: no motion, the gripper half closed.
+    /// Zeros: no motion where actions are displacements or velocities, the gripper half closed. Holds where they are positions.
     Zero,
     /// This action.
     Given([f32; ACTION_LEN]),
-}
-
-impl Fallback {
-    /// The action, after `last` was sent in this episode.
-    #[must_use]
-    pub fn action(self, last: Option<[f32; ACTION_LEN]>) -> [f32; ACTION_LEN] {
-        match self {
-            Self::Hold => last.unwrap_or_default(),
-            Self::Zero => [0.0; ACTION_LEN],
-            Self::Given(action) => action,
-        }
-    }
 }
 
 impl FromStr for Fallback {
@@ -54,64 +44,105 @@ impl FromStr for Fallback {
 pub struct Passed {
     /// The action, fit to be sent.
     pub action: [f32; ACTION_LEN],
-    /// It was not finite, and is the fallback of zeros instead.
+    /// It was not finite, and is the held action instead.
     pub was_not_finite: bool,
     /// The rate limit has changed it.
     pub rate_limited: bool,
 }
 
-/// Makes every action fit.
+/// Makes every action fit, and knows what the robot does without a new one.
 #[derive(Debug, Clone, Copy)]
 pub struct Gate {
     limits: ActionLimits,
+    mode: ActionMode,
     rate_max: Option<f32>,
-    last: Option<[f32; ACTION_LEN]>,
+    /// What the robot executes as far as is known: executed as the last observation says, or sent since.
+    held: Option<[f32; ACTION_LEN]>,
+    /// What was sent last in this episode.
+    sent: Option<[f32; ACTION_LEN]>,
 }
 
 impl Gate {
-    /// A gate with the bundle's limits; with `rate_max`, no component moves by more than that from one action to the next.
+    /// A gate with the limits of a bundle; with `rate_max`, no component moves by more than that from what was executed last.
     #[must_use]
-    pub fn new(limits: ActionLimits, rate_max: Option<f32>) -> Self {
+    pub fn new(control: &Control, rate_max: Option<f32>) -> Self {
         // Written so that NaN allows no motion.
-        Self { limits, rate_max: rate_max.map(|rate_max| rate_max.max(0.0)), last: None }
+        let rate_max = rate_max.map(|rate_max| rate_max.max(0.0));
+        Self {
+            limits: ActionLimits::of(control),
+            mode: control.action_mode,
+            rate_max,
+            held: None,
+            sent: None,
+        }
     }
 
-    /// Another policy, with limits of its own. What was sent last was sent.
-    pub fn take_limits(&mut self, limits: ActionLimits) {
-        self.limits = limits;
+    /// Another policy, with limits of its own. What was executed and sent was executed and sent.
+    pub fn take_limits(&mut self, control: &Control) {
+        (self.limits, self.mode) = (ActionLimits::of(control), control.action_mode);
     }
 
-    /// The last action sent in this episode.
+    /// A new observation, the first of an episode or where the controller joined one: takes over what the robot has executed. An
+    /// observation that is refused tells nothing, unless nothing else is known.
+    pub fn observed(&mut self, observation: &Observation, is_first: bool) {
+        let absolute = self.mode == ActionMode::Absolute;
+        if is_first {
+            self.sent = None;
+            if !absolute {
+                // A motion ends with its episode; a position is held.
+                self.held = None;
+            }
+        }
+        let executed = observation.executed_action;
+        // Zeros at a first observation say that nothing was executed, which is no position.
+        let says_nothing =
+            absolute && observation.is(ObservationFlags::FIRST) && executed == [0.0; ACTION_LEN];
+        if observation.is_valid() || (self.held.is_none() && observation.has_executable_action()) {
+            self.held = if says_nothing { self.held } else { Some(executed) };
+        }
+    }
+
+    /// What the robot goes on with when nothing else is sent: what it executed last. Before anything is known, no motion; none where
+    /// zeros are not that.
     #[must_use]
-    pub fn last(&self) -> Option<[f32; ACTION_LEN]> {
-        self.last
+    pub fn held(&self) -> Option<[f32; ACTION_LEN]> {
+        let rest = (self.mode != ActionMode::Absolute).then_some([0.0; ACTION_LEN]);
+        self.held.or(rest)
     }
 
-    /// Another episode: the robot is at rest.
-    pub fn start_episode(&mut self) {
-        self.last = None;
-    }
-
-    /// The action that may be sent in place of `action`.
+    /// The fallback's action; none where there is nothing to hold.
     #[must_use]
-    pub fn pass(&self, action: [f32; ACTION_LEN]) -> Passed {
+    pub fn fallback(&self, fallback: Fallback) -> Option<[f32; ACTION_LEN]> {
+        match fallback {
+            Fallback::Zero if self.mode != ActionMode::Absolute => Some([0.0; ACTION_LEN]),
+            Fallback::Hold | Fallback::Zero => self.held(),
+            Fallback::Given(action) => Some(action),
+        }
+    }
+
+    /// The action that may be sent in place of `action`; none where it is not finite and there is nothing to hold.
+    #[must_use]
+    pub fn pass(&self, action: [f32; ACTION_LEN]) -> Option<Passed> {
         let was_not_finite = action.iter().any(|x| !x.is_finite());
-        let clamped = self.limits.clamp(if was_not_finite { [0.0; ACTION_LEN] } else { action });
-        let limited = self.limit_rate(clamped);
-        Passed { action: limited, was_not_finite, rate_limited: limited != clamped }
+        let wanted = if was_not_finite { self.held()? } else { action };
+        let limited = self.limit_rate(wanted);
+        // Last, whatever was executed: the limits may be narrower than those that it was within.
+        let action = self.limits.clamp(limited);
+        Some(Passed { action, was_not_finite, rate_limited: limited != wanted })
     }
 
     fn limit_rate(&self, action: [f32; ACTION_LEN]) -> [f32; ACTION_LEN] {
-        let Some(rate_max) = self.rate_max else { return action };
-        // At rest is no motion, or what the limits allow that is nearest to it.
-        let last = self.last.unwrap_or_else(|| self.limits.clamp([0.0; ACTION_LEN]));
-        // Between two actions within the limits, so that it stays within them.
-        std::array::from_fn(|i| action[i].clamp(last[i] - rate_max, last[i] + rate_max))
+        let (Some(rate_max), Some(held)) = (self.rate_max, self.held()) else { return action };
+        let near = |action: [f32; ACTION_LEN], to: [f32; ACTION_LEN]| {
+            std::array::from_fn(|i| action[i].clamp(to[i] - rate_max, to[i] + rate_max))
+        };
+        // What was sent last may be executed only after the observation that is answered now: near it too, where that is possible.
+        near(self.sent.map_or(action, |sent| near(action, sent)), held)
     }
 
     /// The action was sent.
     pub fn sent(&mut self, action: [f32; ACTION_LEN]) {
-        self.last = Some(action);
+        (self.held, self.sent) = (Some(action), Some(action));
     }
 }
 
@@ -119,56 +150,170 @@ impl Gate {
 mod tests {
     use super::*;
 
-    const LIMITS: ActionLimits = ActionLimits { low: [-1.0, -1.0, 0.2, -1.0], high: [1.0, 0.5, 1.0, 1.0] };
+    const LOW: [f32; ACTION_LEN] = [-1.0, -1.0, 0.2, -1.0];
+    const HIGH: [f32; ACTION_LEN] = [1.0, 0.5, 1.0, 1.0];
+
+    fn control(mode: ActionMode) -> Control {
+        Control { rate_hz: 40.0, action_low: LOW, action_high: HIGH, action_mode: mode }
+    }
+
+    fn gate(rate_max: Option<f32>) -> Gate {
+        Gate::new(&control(ActionMode::Delta), rate_max)
+    }
 
     fn send(gate: &mut Gate, action: [f32; ACTION_LEN]) -> Passed {
-        let passed = gate.pass(action);
+        let passed = gate.pass(action).unwrap();
         gate.sent(passed.action);
         passed
     }
 
+    fn executed(action: [f32; ACTION_LEN]) -> Observation {
+        let mut observation = Observation::zeroed();
+        observation.executed_action = action;
+        observation
+    }
+
+    fn first(action: [f32; ACTION_LEN]) -> Observation {
+        let mut observation = executed(action);
+        observation.flags = ObservationFlags::FIRST.0;
+        observation
+    }
+
+    fn assert_near(passed: Option<Passed>, expected: [f32; ACTION_LEN]) {
+        let found = passed.unwrap().action;
+        assert!(found.iter().zip(expected).all(|(a, b)| (a - b).abs() < 1e-6), "{found:?}, not {expected:?}");
+    }
+
+    fn within_limits(action: [f32; ACTION_LEN]) -> bool {
+        (0..ACTION_LEN).all(|i| (LOW[i]..=HIGH[i]).contains(&action[i]))
+    }
+
     #[test]
-    fn what_is_not_finite_becomes_zeros_within_the_limits() {
-        let gate = Gate::new(LIMITS, None);
-        for bad in [f32::NAN, f32::INFINITY, f32::NEG_INFINITY] {
-            let passed = gate.pass([0.5, bad, 0.5, 0.5]);
-            assert_eq!((passed.action, passed.was_not_finite), ([0.0, 0.0, 0.2, 0.0], true));
+    fn what_is_not_finite_becomes_what_was_executed_last() {
+        for mode in [ActionMode::Delta, ActionMode::Velocity, ActionMode::Absolute] {
+            let mut gate = Gate::new(&control(mode), None);
+            gate.observed(&executed([0.4, -0.3, 0.5, 0.9]), true);
+            for bad in [f32::NAN, f32::INFINITY, f32::NEG_INFINITY] {
+                let passed = gate.pass([0.5, bad, 0.5, 0.5]).unwrap();
+                assert_eq!((passed.action, passed.was_not_finite), ([0.4, -0.3, 0.5, 0.9], true));
+            }
+            assert!(!gate.pass([9.0; 4]).unwrap().was_not_finite);
+            send(&mut gate, [0.1, 0.2, 0.3, 0.4]);
+            assert_eq!(gate.pass([f32::NAN; 4]).unwrap().action, [0.1, 0.2, 0.3, 0.4]);
         }
-        assert!(!gate.pass([9.0; 4]).was_not_finite);
+    }
+
+    #[test]
+    fn before_anything_is_known_displacements_rest_and_positions_are_not_invented() {
+        for mode in [ActionMode::Delta, ActionMode::Velocity] {
+            let gate = Gate::new(&control(mode), Some(0.1));
+            assert_eq!(gate.fallback(Fallback::Hold), Some([0.0; 4]));
+            assert_eq!(gate.pass([f32::NAN; 4]).unwrap().action, [0.0, 0.0, 0.2, 0.0]);
+        }
+        let mut gate = Gate::new(&control(ActionMode::Absolute), Some(0.1));
+        gate.observed(&first([0.0; 4]), true);
+        let nothing = gate.pass([f32::NAN; 4]).is_none();
+        assert!(
+            nothing && gate.fallback(Fallback::Hold).is_none() && gate.fallback(Fallback::Zero).is_none()
+        );
+        // Nothing tells how far the policy's position is from the robot's.
+        assert_eq!(gate.pass([0.9, 0.4, 0.9, 0.9]).unwrap().action, [0.9, 0.4, 0.9, 0.9]);
+    }
+
+    #[test]
+    fn a_position_is_held_across_the_start_of_an_episode_and_a_motion_is_not() {
+        for (mode, held) in [(ActionMode::Absolute, [0.7; 4]), (ActionMode::Delta, [0.0; 4])] {
+            let mut gate = Gate::new(&control(mode), None);
+            gate.observed(&executed([0.7; 4]), true);
+            gate.observed(&first([0.0; 4]), true);
+            assert_eq!(gate.held(), Some(held), "{mode:?}");
+            assert_eq!(gate.fallback(Fallback::Zero), Some(held), "{mode:?}");
+            // A robot that says where it stands is believed.
+            gate.observed(&first([0.3; 4]), true);
+            assert_eq!(gate.held(), Some([0.3; 4]), "{mode:?}");
+        }
+    }
+
+    #[test]
+    fn an_observation_that_is_refused_changes_what_is_held_only_where_nothing_is_known() {
+        let mut refused = executed([0.6; 4]);
+        refused.reward = f32::NAN;
+        let mut gate = gate(None);
+        gate.observed(&refused, true);
+        assert_eq!(gate.held(), Some([0.6; 4]));
+        gate.sent([0.1; 4]);
+        for bad in [0.8, 3e38, f32::NAN] {
+            refused.executed_action = [bad; 4];
+            gate.observed(&refused, false);
+            assert_eq!(gate.held(), Some([0.1; 4]), "{bad}");
+        }
+        gate.observed(&executed([3e38; 4]), false);
+        assert_eq!(gate.held(), Some([0.1; 4]));
     }
 
     #[test]
     fn no_component_moves_faster_than_the_rate_limit_and_all_stay_within_the_limits() {
-        let mut gate = Gate::new(LIMITS, Some(0.3));
-        let mut last = [0.0, 0.0, 0.2, 0.0];
+        let mut gate = gate(Some(0.3));
+        let mut last = [0.0; 4];
         for wanted in [[9.0; 4], [9.0; 4], [-9.0; 4], [f32::NAN; 4], [-9.0; 4], [0.1, 0.1, 0.3, 0.1]] {
             let action = send(&mut gate, wanted).action;
-            for i in 0..ACTION_LEN {
-                assert!((action[i] - last[i]).abs() <= 0.3 + 1e-6, "{action:?} after {last:?}");
-                assert!((LIMITS.low[i]..=LIMITS.high[i]).contains(&action[i]), "{action:?}");
-            }
+            let near = action.iter().zip(last).all(|(a, b)| (a - b).abs() <= 0.3 + 1e-6);
+            assert!(near && within_limits(action), "{action:?} after {last:?}");
             last = action;
         }
     }
 
     #[test]
-    fn an_episode_starts_from_rest_and_what_was_not_sent_does_not_count() {
-        let mut gate = Gate::new(LIMITS, Some(0.5));
+    fn limits_come_last_even_where_another_policy_has_narrower_ones_than_what_was_sent() {
+        let mut gate = gate(Some(0.1));
+        gate.sent([0.9, 0.5, 0.9, -0.9]);
+        let control = Control { action_low: [-0.2; 4], action_high: [0.2; 4], ..control(ActionMode::Delta) };
+        gate.take_limits(&control);
+        assert_eq!(gate.pass([1.0, 1.0, 1.0, -1.0]).unwrap().action, [0.2, 0.2, 0.2, -0.2]);
+        assert_eq!(gate.pass([f32::NAN; 4]).unwrap().action, [0.2, 0.2, 0.2, -0.2]);
+    }
+
+    #[test]
+    fn the_rate_limit_counts_from_what_was_executed_whoever_moved_the_robot() {
+        let mut gate = gate(Some(0.1));
+        // Joined in the middle of an episode.
+        gate.observed(&executed([0.9, -0.9, 0.9, 0.9]), true);
+        assert_near(gate.pass([-1.0; 4]), [0.8, -1.0, 0.8, 0.8]);
+        send(&mut gate, [0.9, -0.9, 0.9, 0.9]);
+        // What was sent was not executed.
+        gate.observed(&executed([0.0, 0.0, 0.5, 0.0]), false);
+        assert_near(gate.pass([1.0; 4]), [0.1, 0.1, 0.6, 0.1]);
+    }
+
+    #[test]
+    fn an_action_that_is_executed_one_observation_later_is_not_left_by_more_than_the_limit_either() {
+        let mut gate = gate(Some(0.1));
+        gate.observed(&first([0.0; 4]), true);
         send(&mut gate, [1.0; 4]);
-        assert_eq!(gate.pass([1.0; 4]).action, [1.0, 0.5, 1.0, 1.0]);
-        assert_eq!(gate.last().unwrap(), [0.5, 0.5, 0.7, 0.5]);
-        gate.start_episode();
-        assert_eq!(gate.pass([1.0; 4]).action, [0.5, 0.5, 0.7, 0.5]);
-        assert!(!gate.pass([0.1, 0.1, 0.3, 0.1]).rate_limited);
+        gate.observed(&executed([0.0; 4]), false);
+        let back = gate.pass([-1.0; 4]).unwrap().action;
+        assert!(back[0].abs() < 1e-6, "{back:?}, after 0.1 was sent");
+    }
+
+    #[test]
+    fn an_episode_starts_from_rest_and_what_was_not_sent_does_not_count() {
+        let mut gate = gate(Some(0.5));
+        send(&mut gate, [1.0; 4]);
+        assert_eq!(gate.pass([1.0; 4]).unwrap().action, [1.0, 0.5, 1.0, 1.0]);
+        assert_eq!(gate.held(), Some([0.5; 4]));
+        gate.observed(&first([0.0; 4]), true);
+        assert_eq!(gate.pass([1.0; 4]).unwrap().action, [0.5; 4]);
+        assert!(!gate.pass([0.1, 0.1, 0.3, 0.1]).unwrap().rate_limited);
     }
 
     #[test]
     fn fallbacks_are_named_or_given() {
-        let last = Some([0.1, 0.2, 0.3, 0.4]);
-        assert_eq!("hold".parse::<Fallback>().unwrap().action(last), [0.1, 0.2, 0.3, 0.4]);
-        assert_eq!("hold".parse::<Fallback>().unwrap().action(None), [0.0; 4]);
-        assert_eq!("zero".parse::<Fallback>().unwrap().action(last), [0.0; 4]);
-        assert_eq!("0, 0,0.5,-1".parse::<Fallback>().unwrap().action(last), [0.0, 0.0, 0.5, -1.0]);
+        let mut gate = gate(None);
+        gate.sent([0.1, 0.2, 0.3, 0.4]);
+        let action = |text: &str| gate.fallback(text.parse().unwrap()).unwrap();
+        assert_eq!(action("hold"), [0.1, 0.2, 0.3, 0.4]);
+        assert_eq!(action("zero"), [0.0; 4]);
+        assert_eq!(action("0, 0,0.5,-1"), [0.0, 0.0, 0.5, -1.0]);
         for bad in ["", "stop", "1,2,3", "1,2,3,4,5", "0,0,0,NaN", "0,0,0,inf"] {
             assert!(bad.parse::<Fallback>().is_err(), "{bad:?}");
         }

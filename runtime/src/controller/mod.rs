@@ -16,6 +16,7 @@ mod answering;
 mod ended;
 mod episodes;
 mod gate;
+mod guard;
 mod imagined;
 mod machine;
 mod report;
@@ -36,6 +37,7 @@ pub use tick::{Tick, TickObserver, TickTimes};
 use std::sync::atomic::{AtomicBool, Ordering};
 use std::time::{Duration, Instant};
 
+use rcwm_models::bundle::ActionMode;
 use rcwm_models::wire::{Action, ControllerLink, LinkSettings, ObservationSample, Wait, clock::monotonic_ns};
 
 use crate::pacing::{Pacing, PacingSettings, Plan};
@@ -147,15 +149,20 @@ impl Controller {
     /// Connects.
     ///
     /// # Errors
-    /// [`ControllerError::Link`].
+    /// [`ControllerError::Link`], or [`ControllerError::ZeroIsAPose`].
     pub fn open(policy: Policy, settings: ControllerSettings) -> Result<Self, ControllerError> {
+        let control = &policy.manifest().control;
+        if settings.fallback == Fallback::Zero && control.action_mode == ActionMode::Absolute {
+            return Err(ControllerError::ZeroIsAPose);
+        }
+        let gate = Gate::new(control, settings.rate_max);
         let link = ControllerLink::open(settings.link.clone())?;
         Ok(Self {
             link,
             state: State::default(),
             tracker: SequenceTracker::default(),
             pacing: Pacing::new(settings.pacing),
-            gate: Gate::new(policy.limits(), settings.rate_max),
+            gate,
             telemetry: Telemetry::new(),
             surprise: SurpriseTelemetry::new(),
             counters: Counters::default(),
@@ -185,7 +192,7 @@ impl Controller {
         if let Some(swapper) = &self.swapper
             && swapper.poll(moment, &mut self.policy)
         {
-            self.gate.take_limits(self.policy.limits());
+            self.gate.take_limits(&self.policy.manifest().control);
             self.imagined.clear();
             self.fresh_policy = true;
             self.counters.swaps += 1;
@@ -199,11 +206,23 @@ impl Controller {
         self.ask_again(heard, asked)
     }
 
-    /// Answers observations until the simulator closes, enough episodes are done, or `stop` is set.
+    /// Answers observations until the simulator closes, enough episodes are done, or `stop` is set. However that ends, the simulator
+    /// has been told when this returns.
     ///
     /// # Errors
     /// See [`ControllerError`]. Faults of policy, peer or order are no errors as long as they pass: they are counted.
     pub fn run(
+        &mut self,
+        stop: &AtomicBool,
+        observers: &mut [&mut dyn TickObserver],
+    ) -> Result<Ended, ControllerError> {
+        let result = guard::guarded(|| self.answer_all(stop, observers));
+        // First the robot, then everything else. Where it cannot be told, `close` tries again and tells.
+        let _ = self.link.say_closed();
+        result.unwrap_or_else(|said| Err(ControllerError::Panicked(said)))
+    }
+
+    fn answer_all(
         &mut self,
         stop: &AtomicBool,
         observers: &mut [&mut dyn TickObserver],
@@ -356,11 +375,11 @@ impl Controller {
         &self.telemetry
     }
 
-    /// Tells the simulator that no further action will come.
+    /// Tells the simulator that no further action will come, unless [`Self::run`] has.
     ///
     /// # Errors
     /// [`ControllerError::Link`].
-    pub fn close(self) -> Result<(), ControllerError> {
-        Ok(self.link.close()?)
+    pub fn close(&self) -> Result<(), ControllerError> {
+        Ok(self.link.say_closed()?)
     }
 }

@@ -30,7 +30,7 @@ pub struct Counters {
     pub late_observations: u64,
     /// Observations that were published but never seen (real time: overwritten by a later one, or lost).
     pub missed_observations: u64,
-    /// Observations refused because they held numbers that are not finite.
+    /// Observations refused because they held numbers that are not finite, or an executed action out of range.
     pub refused_observations: u64,
     /// Ticks whose outputs were not finite.
     pub non_finite_outputs: u64,
@@ -62,6 +62,10 @@ pub struct Counters {
     pub peers_lost: u64,
     /// Policies taken over while running.
     pub swaps: u64,
+    /// Observations that were scheduled or published later than they were received: the peer's clock is ahead.
+    pub clock_ahead: u64,
+    /// Answers that were not sent because there was nothing fit to send, nor anything known that could be held.
+    pub withheld_answers: u64,
 }
 
 impl Counters {
@@ -69,7 +73,10 @@ impl Counters {
         self.observations += 1;
         match arrival {
             Arrival::Joined { restarted } => self.peer_restarts += u64::from(restarted),
-            Arrival::Next { missed, .. } => self.missed_observations += missed,
+            // What a peer says may be any number.
+            Arrival::Next { missed, .. } => {
+                self.missed_observations = self.missed_observations.saturating_add(missed);
+            }
             Arrival::Repeated => self.repeated_observations += 1,
             Arrival::Stale => self.stale_observations += 1,
         }
@@ -292,6 +299,19 @@ impl RunReport {
             c.engine_errors,
             c.rate_limited
         );
+        if c.clock_ahead > 0 {
+            text += &format!(
+                "clock      {} observations were scheduled or published later than they were received: the robot's clock is \
+                 ahead; use CLOCK_MONOTONIC of this machine\n",
+                c.clock_ahead
+            );
+        }
+        if c.withheld_answers > 0 {
+            text += &format!(
+                "withheld   {} answers: nothing fit to send, and no position known that could be held\n",
+                c.withheld_answers
+            );
+        }
         text += &self.surprise_line();
         for line in self.realtime.iter().flat_map(Granted::lines) {
             text += &format!("realtime   {line}\n");

@@ -21,6 +21,14 @@ pub enum Arrival {
     Stale,
 }
 
+impl Arrival {
+    /// Whether the observation has not been seen, and is later than those that have.
+    #[must_use]
+    pub fn is_new(self) -> bool {
+        matches!(self, Self::Joined { .. } | Self::Next { .. })
+    }
+}
+
 /// Publisher, sequence and episode of the last observation.
 #[derive(Debug, Clone, Copy, Default)]
 pub struct SequenceTracker {
@@ -35,10 +43,10 @@ struct Seen {
 }
 
 impl SequenceTracker {
-    /// Places an observation, and remembers it unless it is repeated or stale.
-    pub fn place(&mut self, publisher: u128, sequence: u64, episode: u64) -> Arrival {
-        let seen = Seen { publisher, sequence, episode };
-        let arrival = match self.last {
+    /// How an observation stands to the last one.
+    #[must_use]
+    pub fn look(&self, publisher: u128, sequence: u64, episode: u64) -> Arrival {
+        match self.last {
             None => Arrival::Joined { restarted: false },
             // Sequences of two publishers do not compare: a simulator that was started again counts from 0.
             Some(last) if last.publisher != publisher => Arrival::Joined { restarted: true },
@@ -47,9 +55,14 @@ impl SequenceTracker {
             Some(last) => {
                 Arrival::Next { missed: sequence - last.sequence - 1, new_episode: last.episode != episode }
             }
-        };
-        if matches!(arrival, Arrival::Joined { .. } | Arrival::Next { .. }) {
-            self.last = Some(seen);
+        }
+    }
+
+    /// Places an observation, and remembers it unless it is repeated or stale.
+    pub fn place(&mut self, publisher: u128, sequence: u64, episode: u64) -> Arrival {
+        let arrival = self.look(publisher, sequence, episode);
+        if arrival.is_new() {
+            self.last = Some(Seen { publisher, sequence, episode });
         }
         arrival
     }

@@ -50,12 +50,14 @@ impl Controller {
         counters.published_late += u64::from(published_ns > scheduled_ns.saturating_add(period_ns));
         let missed = times.sent_ns == 0 || from_schedule_ns > period_ns;
         let ours_in_time = times.sent_ns > 0 && ended_ns.saturating_sub(published_ns) <= period_ns;
-        counters.missed_deadlines += u64::from(missed) + unanswered;
+        // What a peer says may be any number.
+        counters.missed_deadlines =
+            counters.missed_deadlines.saturating_add(unanswered).saturating_add(u64::from(missed));
         counters.missed_deadlines_published_late += u64::from(missed && ours_in_time);
     }
 
     pub(super) fn record_missing(&mut self, missing: &Missing, times: &TickTimes) {
-        self.counters.skipped_ticks += missing.skipped;
+        self.counters.skipped_ticks = self.counters.skipped_ticks.saturating_add(missing.skipped);
         // Where it was not sent, the observation that came instead tells.
         if times.sent_ns > 0 {
             self.telemetry.record(Stage::Imagine, times.sent_ns.saturating_sub(times.received_ns));

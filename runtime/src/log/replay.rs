@@ -60,7 +60,7 @@ impl Replayer {
         Ok(Self {
             engine,
             bundles,
-            gate: Gate::new(policy.limits(), header.rate_max),
+            gate: Gate::new(&policy.manifest().control, header.rate_max),
             policy,
             telemetry: Telemetry::new(),
             report,
@@ -109,9 +109,7 @@ impl Replayer {
     fn exchange(&mut self, identity: &BundleIdentity) -> Result<(), LogError> {
         self.policy = load(&self.bundles, identity, &self.report.log, self.engine)?;
         self.states.clear();
-        let last = self.gate.last();
-        self.gate = Gate::new(self.policy.limits(), self.report.log.rate_max);
-        last.into_iter().for_each(|last| self.gate.sent(last));
+        self.gate.take_limits(&self.policy.manifest().control);
         self.report.swaps += 1;
         Ok(())
     }
@@ -150,6 +148,7 @@ impl Replayer {
         });
         (self.resumed, self.last_sent_known) = (true, false);
         self.states.clear();
+        self.executed(&tick.record);
         self.sent(&tick.record);
         if !taken {
             let what = "the state after dropped ticks".to_owned();
@@ -266,24 +265,31 @@ impl Replayer {
 
     /// What was sent: the policy's action, or the fallback, through the gate.
     fn answer(&mut self, record: &TickRecord) -> Option<[String; 3]> {
-        let (header, logged) = (&self.report.log, record.answer.action);
-        if record.is_first {
-            self.gate.start_episode();
-            self.last_sent_known = true;
-        }
+        let (fallback, logged) = (self.report.log.fallback, record.answer.action);
+        self.executed(record);
         let of_policy = [ActionSource::Policy as u32, ActionSource::Imagined as u32];
         let action = if of_policy.contains(&record.answer.source) {
             self.decided
         } else {
-            Some(header.fallback.action(self.gate.last()))
+            self.gate.fallback(fallback)
         };
-        // An answer that was overtaken has not passed the gate: it was not sent.
-        let replayed =
-            if record.overtaken { action } else { action.map(|action| self.gate.pass(action).action) };
+        let replayed = if record.overtaken {
+            // It was not sent: it has not passed the gate, or there was nothing to send.
+            Some(action.unwrap_or_default())
+        } else {
+            action.and_then(|action| self.gate.pass(action)).map(|passed| passed.action)
+        };
         let known = self.last_sent_known;
         self.sent(record);
         let same = replayed.is_some_and(|replayed| replayed.map(f32::to_bits) == logged.map(f32::to_bits));
         (known && !same).then(|| ["the action sent".into(), format!("{logged:?}"), format!("{replayed:?}")])
+    }
+
+    fn executed(&mut self, record: &TickRecord) {
+        if let Some(observed) = &record.observed {
+            self.gate.observed(&observed.without_picture(), record.is_first);
+            self.last_sent_known |= record.is_first;
+        }
     }
 
     fn sent(&mut self, record: &TickRecord) {

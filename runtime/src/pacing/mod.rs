@@ -14,7 +14,7 @@
 //!
 //! Waiting blocks until shortly before the expected time, gets ready for what will come, polls from there to shortly after the expected
 //! time, and blocks again. How long getting ready takes is learnt from how long it took, and when it is to be done by from how soon after their schedule
-//! observations have come lately. Where ticks were slept through, only the newest is made up for: the others are counted, never run in a burst. In lock-step nothing is due.
+//! observations have come lately. A peer whose clock is ahead is not believed: nothing was scheduled or published later than it was received. Where ticks were slept through, only the newest is made up for: the others are counted, never run in a burst. In lock-step nothing is due.
 
 use std::time::Duration;
 
@@ -73,6 +73,34 @@ pub struct Missing {
     pub skipped: u64,
 }
 
+/// When an observation was scheduled and published, as far as that can be: both are over when it is received.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub struct Stamps {
+    /// When it was scheduled, CLOCK_MONOTONIC in ns.
+    pub scheduled_ns: u64,
+    /// When it was published.
+    pub published_ns: u64,
+    /// How far the peer's clock is ahead at least; 0 where nothing tells that it is.
+    pub ahead_ns: u64,
+}
+
+impl Stamps {
+    /// Those of an observation that was received at `received_ns`.
+    #[must_use]
+    pub fn of(observation: &Observation, received_ns: u64) -> Self {
+        let Observation { scheduled_ns, published_ns, period_ns, .. } = *observation;
+        let published_ahead_ns = published_ns.saturating_sub(received_ns);
+        // One may be published a little before it is due.
+        let scheduled_ahead_ns = scheduled_ns.saturating_sub(received_ns.saturating_add(period_ns));
+        let published_ns = published_ns.min(received_ns);
+        Self {
+            scheduled_ns: if scheduled_ns > received_ns { published_ns } else { scheduled_ns },
+            published_ns,
+            ahead_ns: published_ahead_ns.max(scheduled_ahead_ns),
+        }
+    }
+}
+
 /// The schedule of the peer, as far as its last observation tells.
 #[derive(Debug, Clone, Copy)]
 pub struct Pacing {
@@ -114,14 +142,15 @@ impl Pacing {
         Self { settings, schedule: None, lead_ns: 0, soonest_ns: None }
     }
 
-    /// Takes the schedule over from an observation. After the last of an episode nothing is due: a reset takes its time.
-    pub fn observed(&mut self, observation: &Observation) {
+    /// Takes the schedule over from an observation that was received at `received_ns`. After the last of an episode nothing is due: a reset takes its time.
+    pub fn observed(&mut self, observation: &Observation, received_ns: u64) {
         if observation.period_ns == 0 || observation.is(ObservationFlags::LAST) {
             self.schedule = None;
             return;
         }
         let period_ns = observation.period_ns.max(PERIOD_NS_MIN);
-        let lag_ns = observation.published_ns.saturating_sub(observation.scheduled_ns);
+        let Stamps { scheduled_ns, published_ns, .. } = Stamps::of(observation, received_ns);
+        let lag_ns = published_ns.saturating_sub(scheduled_ns);
         // Down at once, up slowly.
         let soonest_ns = self
             .soonest_ns
@@ -129,8 +158,8 @@ impl Pacing {
         self.soonest_ns = Some(soonest_ns);
         self.schedule = Some(Schedule {
             sequence: observation.sequence,
-            scheduled_ns: observation.scheduled_ns,
-            base_ns: observation.scheduled_ns.max(observation.published_ns),
+            scheduled_ns,
+            base_ns: scheduled_ns.max(published_ns),
             sooner_ns: lag_ns - soonest_ns,
             period_ns,
             grace_ns: share(period_ns, self.settings.grace_periods),
@@ -158,7 +187,7 @@ impl Pacing {
     /// publisher waits.
     #[must_use]
     pub fn is_stale(&self, observation: &Observation, received_ns: u64) -> bool {
-        let age_ns = received_ns.saturating_sub(observation.scheduled_ns);
+        let age_ns = received_ns.saturating_sub(Stamps::of(observation, received_ns).scheduled_ns);
         observation.period_ns > 0
             && age_ns > share(observation.period_ns.max(PERIOD_NS_MIN), self.settings.stale_periods)
     }
@@ -236,7 +265,7 @@ mod tests {
 
     fn after(observation: &Observation) -> Pacing {
         let mut pacing = Pacing::new(settings());
-        pacing.observed(observation);
+        pacing.observed(observation, observation.published_ns);
         pacing
     }
 
@@ -268,7 +297,7 @@ mod tests {
         let mut pacing = ready(after(&observation()), 80_000);
         let polls_ns = PUBLISHED_NS + PERIOD_NS - 100_000;
         assert_eq!(pacing.plan(polls_ns - 100_000), wait(0, 100_000), "ready for this one already");
-        pacing.observed(&observation());
+        pacing.observed(&observation(), PUBLISHED_NS);
         assert_eq!(pacing.plan(polls_ns - 100_001), wait(0, 1), "a quarter more than it took");
         assert_eq!(pacing.plan(polls_ns - 100_000), Plan::GetReady);
         let mut pacing = ready(pacing, 80_000);
@@ -281,17 +310,17 @@ mod tests {
         let mut pacing = ready(after(&observation()), 80_000);
         let mut late = observation();
         late.published_ns += 64_000;
-        pacing.observed(&late);
+        pacing.observed(&late, late.published_ns);
         let polls_ns = late.published_ns + PERIOD_NS - 100_000;
         // 64 us sooner than expected, of which a 32nd is forgotten.
         assert_eq!(pacing.plan(polls_ns - 100_000 - 62_001), wait(0, 1));
         assert_eq!(pacing.plan(polls_ns - 100_000 - 62_000), Plan::GetReady);
         for _ in 0..500 {
-            pacing.observed(&late);
+            pacing.observed(&late, late.published_ns);
         }
         assert_ne!(pacing.plan(polls_ns - 100_100), Plan::GetReady, "they come later now");
         late.published_ns += 100 * PERIOD_NS;
-        pacing.observed(&late);
+        pacing.observed(&late, late.published_ns);
         let polls_ns = late.published_ns + PERIOD_NS - 100_000;
         assert_eq!(pacing.plan(polls_ns - PERIOD_NS / 4 - 1), wait(0, 1), "never earlier than that");
     }
@@ -299,7 +328,7 @@ mod tests {
     #[test]
     fn it_does_not_get_ready_where_that_is_not_wanted() {
         let mut pacing = Pacing::new(PacingSettings { gets_ready: false, ..settings() });
-        pacing.observed(&observation());
+        pacing.observed(&observation(), PUBLISHED_NS);
         assert_eq!(pacing.plan(PUBLISHED_NS + PERIOD_NS - 100_000), wait(200_000, 200_000));
     }
 
@@ -307,12 +336,12 @@ mod tests {
     fn getting_ready_never_takes_more_than_a_quarter_of_the_period_ahead_and_is_forgotten_in_time() {
         let mut pacing = ready(after(&observation()), 50 * PERIOD_NS);
         let polls_ns = PUBLISHED_NS + PERIOD_NS - 100_000;
-        pacing.observed(&observation());
+        pacing.observed(&observation(), PUBLISHED_NS);
         assert_eq!(pacing.plan(polls_ns - PERIOD_NS / 4 - 1), wait(0, 1));
         for _ in 0..600 {
             pacing.got_ready(Duration::from_nanos(80_000));
         }
-        pacing.observed(&observation());
+        pacing.observed(&observation(), PUBLISHED_NS);
         assert_eq!(pacing.plan(polls_ns - 100_001), wait(0, 1));
     }
 
@@ -360,6 +389,27 @@ mod tests {
         assert!(!pacing.is_stale(&seen, 0), "one from the future is not stale");
         seen.period_ns = 0;
         assert!(!pacing.is_stale(&seen, u64::MAX));
+    }
+
+    #[test]
+    fn nothing_was_scheduled_or_published_later_than_it_was_received() {
+        let (received_ns, late_ns) = (PUBLISHED_NS + 50_000, PUBLISHED_NS + 3 * PERIOD_NS);
+        let seen = |scheduled_ns, published_ns| Observation { scheduled_ns, published_ns, ..observation() };
+        let stamps = |seen: Observation| {
+            let Stamps { scheduled_ns, published_ns, ahead_ns } = Stamps::of(&seen, received_ns);
+            (scheduled_ns, published_ns, ahead_ns)
+        };
+        assert_eq!(stamps(observation()), (10_000_000, PUBLISHED_NS, 0));
+        // Published a little before it was due: no clock is ahead.
+        assert_eq!(stamps(seen(received_ns + 1, PUBLISHED_NS)), (PUBLISHED_NS, PUBLISHED_NS, 0));
+        let scheduled_ahead = seen(late_ns, PUBLISHED_NS);
+        assert_eq!(stamps(scheduled_ahead), (PUBLISHED_NS, PUBLISHED_NS, late_ns - received_ns - PERIOD_NS));
+        assert_eq!(stamps(seen(u64::MAX, u64::MAX)), (received_ns, received_ns, u64::MAX - received_ns));
+        for ahead in [scheduled_ahead, seen(u64::MAX, u64::MAX), seen(0, u64::MAX)] {
+            let mut pacing = Pacing::new(settings());
+            pacing.observed(&ahead, received_ns);
+            assert_eq!(pacing.plan(received_ns + PERIOD_NS * 3 / 2), Plan::Overdue, "{ahead:?}");
+        }
     }
 
     #[test]

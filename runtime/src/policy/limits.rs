@@ -19,13 +19,10 @@ impl ActionLimits {
         Self { low: control.action_low, high: control.action_high }
     }
 
-    /// The nearest action within the limits; a component that is no number becomes the one nearest to 0.
+    /// The nearest action within the limits. A component that is no number stays none: no action is nearest to it.
     #[must_use]
     pub fn clamp(&self, action: [f32; ACTION_LEN]) -> [f32; ACTION_LEN] {
-        std::array::from_fn(|i| {
-            let value = if action[i].is_nan() { 0.0 } else { action[i] };
-            value.clamp(self.low[i], self.high[i])
-        })
+        std::array::from_fn(|i| action[i].clamp(self.low[i], self.high[i]))
     }
 }
 
@@ -37,7 +34,8 @@ mod tests {
     fn no_action_leaves_the_limits() {
         let limits = ActionLimits { low: [-1.0, -0.5, 0.25, -1.0], high: [1.0, 0.5, 0.75, 1.0] };
         assert_eq!(limits.clamp([2.0, -2.0, 0.0, 0.5]), [1.0, -0.5, 0.25, 0.5]);
-        let odd = [f32::INFINITY, f32::NEG_INFINITY, f32::NAN, f32::NAN];
-        assert_eq!(limits.clamp(odd), [1.0, -0.5, 0.25, 0.0]);
+        let odd = limits.clamp([f32::INFINITY, f32::NEG_INFINITY, 0.5, f32::NAN]);
+        assert_eq!(odd[..3], [1.0, -0.5, 0.5]);
+        assert!(odd[3].is_nan());
     }
 }

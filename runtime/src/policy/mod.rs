@@ -212,9 +212,8 @@ impl Policy {
         self.ahead = None;
         let (tick, mut work) = self.work(&mut clock);
         tick.observe(image, &mut work)?;
-        self.state.take_posterior(&self.buffers);
         let surprise = Some(self.buffers.surprise());
-        Ok(self.decide(&clock, surprise, recomputed))
+        self.decide(&clock, surprise, recomputed)
     }
 
     /// Computes all of the next tick that needs only the action before it (robot prior, interaction, environment's recurrence),
@@ -269,8 +268,7 @@ impl Policy {
         self.ahead = None;
         let (tick, mut work) = self.work(&mut clock);
         tick.imagine(&mut work)?;
-        self.state.take_posterior(&self.buffers);
-        Ok(self.decide(&clock, None, recomputed))
+        self.decide(&clock, None, recomputed)
     }
 
     fn before(action: Option<&[f32; ACTION_LEN]>) -> Result<Before, PolicyError> {
@@ -308,11 +306,21 @@ impl Policy {
         (tick.as_mut(), Work { state, noise, buffers, clock })
     }
 
-    fn decide(&mut self, clock: &StageClock, surprise: Option<Surprise>, recomputed: bool) -> Decision {
+    /// The action of the tick that is in the buffers, whose state is carried on.
+    fn decide(
+        &mut self,
+        clock: &StageClock,
+        surprise: Option<Surprise>,
+        recomputed: bool,
+    ) -> Result<Decision, PolicyError> {
         let StageClock { spent_ns: stage_ns, helper_late, .. } = *clock;
         let (mean, std) = (self.buffers.mean, self.buffers.std);
-        let action = self.limits.clamp(self.noise.action(&mean, &std));
-        Decision { action, mean, std, stage_ns, surprise, recomputed, helper_late }
+        let action = self.noise.action(&mean, &std);
+        // A sample of two finite numbers can be too large for one: no limit makes that an action.
+        parts::finite(PartName::Actor, "mean", &action)?;
+        self.state.take_posterior(&self.buffers);
+        let action = self.limits.clamp(action);
+        Ok(Decision { action, mean, std, stage_ns, surprise, recomputed, helper_late })
     }
 
     /// Goes back to the learned initial state.

@@ -219,7 +219,9 @@ pub fn observation(sequence: u64, step: u32) -> Observation {
 
 /// A picture that differs from step to step.
 pub fn image(step: u32) -> [u8; IMAGE_BYTES] {
-    std::array::from_fn(|i| ((i as u32).wrapping_mul(2_654_435_761).wrapping_add(step * 977) >> 13) as u8)
+    std::array::from_fn(|i| {
+        ((i as u32).wrapping_mul(2_654_435_761).wrapping_add(step.wrapping_mul(977)) >> 13) as u8
+    })
 }
 
 /// Publishes an observation and waits for the action that answers it.
