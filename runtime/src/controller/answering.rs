@@ -1,7 +1,6 @@
 //! One tick: with an observation, or without one.
 
 use rcwm_models::ACTION_LEN;
-use rcwm_models::wire::clock::monotonic_ns;
 use rcwm_models::wire::{Action, ActionSource, Observation, ObservationFlags, ObservationSample};
 
 use super::{
@@ -40,7 +39,7 @@ impl Controller {
         sample: &ObservationSample,
         observers: &mut [&mut dyn TickObserver],
     ) -> Result<Taken, ControllerError> {
-        let received_ns = monotonic_ns();
+        let received_ns = self.link.now_ns();
         let observation: &Observation = sample.payload();
         self.counters.clock_ahead += u64::from(Stamps::of(observation, received_ns).ahead_ns > 0);
         if self.pacing.is_stale(observation, received_ns) {
@@ -213,7 +212,7 @@ impl Controller {
         &mut self,
         observers: &mut [&mut dyn TickObserver],
     ) -> Result<(), ControllerError> {
-        let found_ns = monotonic_ns();
+        let found_ns = self.link.now_ns();
         let Some(missing) = self.pacing.take_overdue(found_ns) else { return Ok(()) };
         let (state, response) = step(self.state, Event::Overdue, self.settings.ticks);
         self.state = state;
@@ -227,7 +226,7 @@ impl Controller {
             }
         };
         // What has come by now is worth more than an answer without it, if it will be answered itself.
-        self.newer = self.link.poll_observation()?;
+        self.newer = self.link.poll()?;
         let overtaken = self.newer.as_ref().is_some_and(|newer| self.will_answer(newer));
         let answer = self.send_unless(overtaken, missing.sequence, source, action)?;
         let times = TickTimes {
@@ -276,11 +275,11 @@ impl Controller {
     /// where the tick's time is over, so that a tick in time loses none.
     fn is_overtaken(&mut self, observation: &Observation, received_ns: u64) -> Result<bool, ControllerError> {
         let (period_ns, due_ns) = (observation.period_ns, Stamps::of(observation, received_ns).scheduled_ns);
-        if period_ns == 0 || monotonic_ns() <= due_ns.saturating_add(period_ns) {
+        if period_ns == 0 || self.link.now_ns() <= due_ns.saturating_add(period_ns) {
             return Ok(false);
         }
-        self.newer = self.link.poll_observation()?;
-        Ok(self.newer.as_ref().is_some_and(|newer| self.arrival(newer, monotonic_ns()).is_new()))
+        self.newer = self.link.poll()?;
+        Ok(self.newer.as_ref().is_some_and(|newer| self.arrival(newer, self.link.now_ns()).is_new()))
     }
 
     /// What an observation is to those before it; one that was due too long ago is stale, whatever its number.
@@ -294,7 +293,7 @@ impl Controller {
 
     /// Whether an observation that has come will get an answer of its own, however many ticks were answered without it.
     fn will_answer(&self, sample: &ObservationSample) -> bool {
-        let arrival = self.arrival(sample, monotonic_ns());
+        let arrival = self.arrival(sample, self.link.now_ns());
         let again = || {
             let known = self.own_answer.is_some_and(|own| own.answers == sample.sequence);
             known && sample.is(ObservationFlags::REPEATED)
@@ -349,10 +348,10 @@ impl Controller {
 
     /// In the idle time: all of the next tick that needs only the action. What fails here fails again, and is counted, in the tick.
     fn work_ahead(&mut self, action: Option<&[f32; ACTION_LEN]>) {
-        let start_ns = monotonic_ns();
+        let start_ns = self.link.now_ns();
         // See above: the tick tells.
         let _ = self.policy.work_ahead(action.filter(|_| !self.fresh_policy));
-        self.telemetry.record(Stage::Ahead, monotonic_ns() - start_ns);
+        self.telemetry.record(Stage::Ahead, self.link.now_ns() - start_ns);
     }
 
     fn show(&self, ticked: &Ticked<'_>, observers: &mut [&mut dyn TickObserver]) {

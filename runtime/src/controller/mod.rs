@@ -24,6 +24,7 @@ mod sequence;
 mod surprise;
 mod tick;
 mod times;
+mod transport;
 
 pub use ended::{ControllerError, Ended};
 pub use episodes::{EPISODES_KEPT, Episodes};
@@ -33,12 +34,13 @@ pub use report::{Counters, EpisodeResult, Pace, RunReport};
 pub use sequence::{Arrival, SequenceTracker};
 pub use surprise::{BranchSurprise, SurpriseLimits, SurpriseReport};
 pub use tick::{Tick, TickObserver, TickTimes};
+pub use transport::Transport;
 
 use std::sync::atomic::{AtomicBool, Ordering};
-use std::time::{Duration, Instant};
+use std::time::Duration;
 
 use rcwm_models::bundle::ActionMode;
-use rcwm_models::wire::{Action, ControllerLink, LinkSettings, ObservationSample, Wait, clock::monotonic_ns};
+use rcwm_models::wire::{Action, ControllerLink, LinkSettings, ObservationSample, Wait};
 
 use crate::pacing::{Pacing, PacingSettings, Plan};
 use crate::policy::Policy;
@@ -99,7 +101,7 @@ impl ControllerSettings {
 /// A policy on a link.
 pub struct Controller {
     policy: Policy,
-    link: ControllerLink,
+    link: Box<dyn Transport>,
     settings: ControllerSettings,
     state: State,
     tracker: SequenceTracker,
@@ -151,13 +153,27 @@ impl Controller {
     /// # Errors
     /// [`ControllerError::Link`], or [`ControllerError::ZeroIsAPose`].
     pub fn open(policy: Policy, settings: ControllerSettings) -> Result<Self, ControllerError> {
-        let control = &policy.manifest().control;
-        if settings.fallback == Fallback::Zero && control.action_mode == ActionMode::Absolute {
-            return Err(ControllerError::ZeroIsAPose);
-        }
-        let gate = Gate::new(control, settings.rate_max);
+        // What is wrong with the settings is said before anybody is connected to.
+        let gate = gate(&policy, &settings)?;
         let link = ControllerLink::open(settings.link.clone())?;
-        Ok(Self {
+        Ok(Self::with(Box::new(link), gate, policy, settings))
+    }
+
+    /// A controller on a transport that is open.
+    ///
+    /// # Errors
+    /// [`ControllerError::ZeroIsAPose`].
+    pub fn on(
+        link: Box<dyn Transport>,
+        policy: Policy,
+        settings: ControllerSettings,
+    ) -> Result<Self, ControllerError> {
+        let gate = gate(&policy, &settings)?;
+        Ok(Self::with(link, gate, policy, settings))
+    }
+
+    fn with(link: Box<dyn Transport>, gate: Gate, policy: Policy, settings: ControllerSettings) -> Self {
+        Self {
             link,
             state: State::default(),
             tracker: SequenceTracker::default(),
@@ -179,7 +195,7 @@ impl Controller {
             settings,
             swapper: None,
             fresh_policy: false,
-        })
+        }
     }
 
     /// Takes over policies that are ready at a swap desk.
@@ -200,10 +216,10 @@ impl Controller {
     }
 
     /// Nothing came: time for what need not be done in a tick.
-    fn idle(&mut self, heard: Instant, asked: &mut Instant) -> Result<(), ControllerError> {
+    fn idle(&mut self, heard_ns: u64, asked_ns: &mut u64) -> Result<(), ControllerError> {
         self.swap(if self.running.is_some() { Moment::InEpisode } else { Moment::BetweenEpisodes });
-        self.bear_silence(heard)?;
-        self.ask_again(heard, asked)
+        self.bear_silence(heard_ns)?;
+        self.ask_again(heard_ns, asked_ns)
     }
 
     /// Answers observations until the simulator closes, enough episodes are done, or `stop` is set. However that ends, the simulator
@@ -227,8 +243,8 @@ impl Controller {
         stop: &AtomicBool,
         observers: &mut [&mut dyn TickObserver],
     ) -> Result<Ended, ControllerError> {
-        let start = Instant::now();
-        let (mut heard, mut asked) = (start, start);
+        let start_ns = self.link.now_ns();
+        let (mut heard_ns, mut asked_ns) = (start_ns, start_ns);
         loop {
             if stop.load(Ordering::Relaxed) {
                 return Ok(Ended::Interrupted);
@@ -248,9 +264,9 @@ impl Controller {
                 }
             };
             if taken == Taken::Nothing {
-                self.idle(heard, &mut asked)?;
+                self.idle(heard_ns, &mut asked_ns)?;
             } else {
-                heard = Instant::now();
+                heard_ns = self.link.now_ns();
             }
             self.looked &= taken != Taken::New;
             if self.settings.episodes_max.is_some_and(|max| self.whole_episodes >= max) {
@@ -264,10 +280,10 @@ impl Controller {
         if let Some(sample) = self.newer.take() {
             return Ok(Brought::Observation(sample));
         }
-        let mut plan = self.pacing.plan(monotonic_ns());
+        let mut plan = self.pacing.plan(self.link.now_ns());
         if plan == Plan::GetReady {
             self.get_ready();
-            plan = self.pacing.plan(monotonic_ns());
+            plan = self.pacing.plan(self.link.now_ns());
         }
         let wait = match plan {
             // What has come while the time ran out wins, but is looked at once: observations of no use, however many, do not keep
@@ -277,14 +293,14 @@ impl Controller {
             Plan::GetReady => Ok(Wait::TimedOut),
             Plan::Overdue => {
                 self.looked = true;
-                Ok(self.link.poll_observation()?.map_or(Wait::TimedOut, Wait::Message))
+                Ok(self.link.poll()?.map_or(Wait::TimedOut, Wait::Message))
             }
             Plan::Wait { spin, timeout } => {
                 self.looked = false;
                 if spin > Duration::ZERO {
                     self.policy.wake();
                 }
-                self.link.wait_observation_polling(spin, timeout.min(WAIT_SLICE))
+                self.link.wait(spin, timeout.min(WAIT_SLICE))
             }
         };
         match wait {
@@ -300,9 +316,9 @@ impl Controller {
 
     /// Prepares the policy for an observation that will come soon.
     fn get_ready(&mut self) {
-        let start = Instant::now();
+        let start_ns = self.link.now_ns();
         self.policy.expect_image();
-        let took = start.elapsed();
+        let took = self.since(start_ns);
         self.pacing.got_ready(took);
         self.telemetry.record(Stage::Ready, took.as_nanos() as u64);
     }
@@ -315,9 +331,9 @@ impl Controller {
     }
 
     /// Ends the run when nobody has been there for too long.
-    fn bear_silence(&self, heard: Instant) -> Result<(), ControllerError> {
+    fn bear_silence(&self, heard_ns: u64) -> Result<(), ControllerError> {
         let instance = || self.settings.link.instance.clone();
-        let over = |max: Option<Duration>| max.filter(|max| heard.elapsed() >= *max);
+        let over = |max: Option<Duration>| max.filter(|max| self.since(heard_ns) >= *max);
         if self.counters.observations == 0 {
             match over(self.settings.first_timeout) {
                 Some(timeout) => Err(ControllerError::NoObservation {
@@ -337,13 +353,17 @@ impl Controller {
     }
 
     /// Cleans up after dead peers and asks for the present observation, once in a while.
-    fn ask_again(&self, heard: Instant, asked: &mut Instant) -> Result<(), ControllerError> {
-        if heard.elapsed() >= QUIET && asked.elapsed() >= QUIET {
+    fn ask_again(&self, heard_ns: u64, asked_ns: &mut u64) -> Result<(), ControllerError> {
+        if self.since(heard_ns) >= QUIET && self.since(*asked_ns) >= QUIET {
             self.link.clean_up_dead_peers();
             self.link.hello()?;
-            *asked = Instant::now();
+            *asked_ns = self.link.now_ns();
         }
         Ok(())
+    }
+
+    fn since(&self, start_ns: u64) -> Duration {
+        Duration::from_nanos(self.link.now_ns().saturating_sub(start_ns))
     }
 
     /// What happened so far.
@@ -382,4 +402,13 @@ impl Controller {
     pub fn close(&self) -> Result<(), ControllerError> {
         Ok(self.link.say_closed()?)
     }
+}
+
+/// The gate of a policy under these settings.
+fn gate(policy: &Policy, settings: &ControllerSettings) -> Result<Gate, ControllerError> {
+    let control = &policy.manifest().control;
+    if settings.fallback == Fallback::Zero && control.action_mode == ActionMode::Absolute {
+        return Err(ControllerError::ZeroIsAPose);
+    }
+    Ok(Gate::new(control, settings.rate_max))
 }

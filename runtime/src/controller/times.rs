@@ -1,6 +1,5 @@
 //! The times of a tick, counted from when it was scheduled: one that is late or never answered cannot hide.
 
-use rcwm_models::wire::clock::monotonic_ns;
 use rcwm_models::wire::{Observation, ObservationFlags};
 
 use super::{Controller, Pace, TickTimes};
@@ -31,7 +30,7 @@ impl Controller {
         let period_ns = observation.period_ns;
         self.pace = Some(Pace::of(period_ns));
         // An answer that was overtaken is late by all the time until now.
-        let ended_ns = if times.sent_ns == 0 { monotonic_ns() } else { times.sent_ns };
+        let ended_ns = if times.sent_ns == 0 { self.link.now_ns() } else { times.sent_ns };
         let telemetry = &mut self.telemetry;
         telemetry.record(Stage::Receive, received_ns.saturating_sub(published_ns));
         telemetry.record(Stage::Tick, ended_ns.saturating_sub(received_ns));
