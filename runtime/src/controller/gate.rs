@@ -88,8 +88,9 @@ impl Gate {
         let absolute = self.mode == ActionMode::Absolute;
         if is_first {
             self.sent = None;
-            if !absolute {
-                // A motion ends with its episode; a position is held.
+            if !absolute && observation.is(ObservationFlags::FIRST) {
+                // A motion ends with its episode; a position is held. Where the first observation was lost, or the controller has
+                // joined another publisher, nothing says that the robot rests.
                 self.held = None;
             }
         }
@@ -232,6 +233,18 @@ mod tests {
             gate.observed(&first([0.3; 4]), true);
             assert_eq!(gate.held(), Some([0.3; 4]), "{mode:?}");
         }
+    }
+
+    #[test]
+    fn a_robot_that_does_not_say_that_it_starts_is_not_taken_to_rest() {
+        let mut gate = gate(Some(0.1));
+        gate.sent([0.4; 4]);
+        // Another episode or another publisher, whose first observation never came, with numbers that are none.
+        gate.observed(&executed([f32::NAN; 4]), true);
+        assert_eq!(gate.fallback(Fallback::Hold), Some([0.4; 4]));
+        assert_near(gate.pass([-1.0; 4]), [0.3; 4]);
+        gate.observed(&first([0.0; 4]), true);
+        assert_eq!(gate.fallback(Fallback::Hold), Some([0.0; 4]));
     }
 
     #[test]

@@ -129,6 +129,11 @@ struct Schedule {
 }
 
 impl Schedule {
+    /// Ticks after the last observation that a sequence is left for: a stand-in never answers one that is there.
+    fn ticks_max(&self) -> u64 {
+        u64::MAX - self.sequence
+    }
+
     /// When the observation `ticks` after the last is expected.
     fn expected_ns(&self, ticks: u64) -> u64 {
         self.base_ns.saturating_add(self.period_ns.saturating_mul(ticks))
@@ -196,7 +201,8 @@ impl Pacing {
     #[must_use]
     pub fn plan(&self, now_ns: u64) -> Plan {
         let spin = self.settings.spin;
-        let Some(schedule) = self.schedule else { return Plan::Wait { spin, timeout: NOTHING_DUE } };
+        let schedule = self.schedule.filter(|schedule| schedule.overdue < schedule.ticks_max());
+        let Some(schedule) = schedule else { return Plan::Wait { spin, timeout: NOTHING_DUE } };
         let expected_ns = schedule.expected_ns(schedule.overdue + 1);
         let overdue_ns = expected_ns.saturating_add(schedule.grace_ns);
         if now_ns >= overdue_ns {
@@ -228,11 +234,11 @@ impl Pacing {
     pub fn take_overdue(&mut self, now_ns: u64) -> Option<Missing> {
         let schedule = self.schedule.as_mut()?;
         let over_ns = now_ns.checked_sub(schedule.base_ns)?.checked_sub(schedule.grace_ns)?;
-        let newest = over_ns / schedule.period_ns;
+        let newest = (over_ns / schedule.period_ns).min(schedule.ticks_max());
         let skipped = newest.checked_sub(schedule.overdue + 1)?;
         schedule.overdue = newest;
         Some(Missing {
-            sequence: schedule.sequence.saturating_add(newest),
+            sequence: schedule.sequence + newest,
             scheduled_ns: schedule.scheduled_ns.saturating_add(schedule.period_ns.saturating_mul(newest)),
             skipped,
         })
@@ -409,6 +415,20 @@ mod tests {
             let mut pacing = Pacing::new(settings());
             pacing.observed(&ahead, received_ns);
             assert_eq!(pacing.plan(received_ns + PERIOD_NS * 3 / 2), Plan::Overdue, "{ahead:?}");
+        }
+    }
+
+    #[test]
+    fn nothing_is_due_after_the_last_sequence() {
+        let mut seen = observation();
+        let idle = Plan::Wait { spin: settings().spin, timeout: NOTHING_DUE };
+        for (sequence, left) in [(u64::MAX, 0), (u64::MAX - 2, 2)] {
+            seen.sequence = sequence;
+            let mut pacing = after(&seen);
+            let given = (2..20).filter_map(|ticks| pacing.take_overdue(PUBLISHED_NS + ticks * PERIOD_NS));
+            let given: Vec<u64> = given.map(|missing| missing.sequence).collect();
+            assert_eq!(given, (1..=left).map(|tick| sequence + tick).collect::<Vec<_>>());
+            assert_eq!(pacing.plan(u64::MAX), idle);
         }
     }
 
