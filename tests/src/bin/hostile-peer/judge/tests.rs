@@ -1,0 +1,200 @@
+//! That the judge objects, and to what.
+
+use std::time::Duration;
+
+use rcwm_models::wire::Observation;
+use rcwm_runtime::controller::{SurpriseLimits, TickLimits};
+use rcwm_runtime::pacing::PacingSettings;
+
+use super::*;
+
+const PERIOD_NS: u64 = 1_000_000;
+const LIMITS: ActionLimits = ActionLimits { low: [-0.5; ACTION_LEN], high: [0.5; ACTION_LEN] };
+
+fn setup() -> Setup {
+    Setup {
+        period_ns: PERIOD_NS,
+        rate_max: None,
+        fallback: Fallback::Hold,
+        ticks: TickLimits { imagined_ticks_max: 1, fallback_ticks_max: 2 },
+        pacing: PacingSettings::default(),
+        surprise: SurpriseLimits::default(),
+        stay: true,
+        episodes_max: None,
+        silence_max: None::<Duration>,
+        bundle: 0,
+        sampling: None,
+        stalls: false,
+        deaf: false,
+    }
+}
+
+fn known(limits: ActionLimits) -> Known {
+    Known { limits, is_sound: true, is_absolute: false }
+}
+
+fn judge(setup: Setup) -> Judge {
+    Judge::new(setup, known(LIMITS), Vec::new())
+}
+
+/// When a message of this sequence is published.
+fn at_ns(sequence: u64) -> u64 {
+    sequence * PERIOD_NS
+}
+
+fn message(sequence: u64) -> Observation {
+    let mut message = Observation::zeroed();
+    (message.sequence, message.period_ns) = (sequence, PERIOD_NS);
+    (message.scheduled_ns, message.published_ns) = (at_ns(sequence), at_ns(sequence));
+    message
+}
+
+fn hear(judge: &mut Judge, message: &Observation) {
+    judge.received(Heard::new(1, message, at_ns(message.sequence)), false);
+}
+
+fn action(answers: u64, source: ActionSource, value: f32) -> Action {
+    Action { answers, published_ns: 0, source: source as u32, reserved: 0, action: [value; ACTION_LEN] }
+}
+
+fn send(judge: &mut Judge, action: Action, now_ns: u64) {
+    judge.sent(&action, None, now_ns, now_ns);
+}
+
+/// Message 1 and its answer, then whatever follows.
+fn after_one(setup: Setup, then: impl FnOnce(&mut Judge)) -> Option<&'static str> {
+    let mut judge = judge(setup);
+    hear(&mut judge, &message(1));
+    send(&mut judge, action(1, ActionSource::Policy, 0.1), at_ns(1));
+    assert!(judge.violation.is_none(), "{:?}", judge.violation);
+    then(&mut judge);
+    judge.violation.map(|violation| violation.kind)
+}
+
+fn answer_to_two(value: f32, change: impl FnOnce(&mut Setup, &mut Observation)) -> Option<&'static str> {
+    let (mut setup, mut second) = (setup(), message(2));
+    change(&mut setup, &mut second);
+    after_one(setup, |judge| {
+        hear(judge, &second);
+        send(judge, action(2, ActionSource::Policy, value), at_ns(2));
+    })
+}
+
+#[test]
+fn a_good_answer_is_none_of_its_business() {
+    assert_eq!(answer_to_two(0.4, |_, _| {}), None);
+    assert_eq!(answer_to_two(0.4, |setup, _| setup.rate_max = Some(0.3)), None);
+}
+
+#[test]
+fn numbers_that_are_none_or_out_of_limits_are_seen() {
+    assert_eq!(answer_to_two(f32::NAN, |_, _| {}), Some("not finite"));
+    assert_eq!(answer_to_two(0.6, |_, _| {}), Some("out of limits"));
+    assert_eq!(answer_to_two(0.4, |setup, _| setup.rate_max = Some(0.1)), Some("rate"));
+}
+
+#[test]
+fn the_new_limits_hold_from_a_swap_on_whatever_the_rate_limit_says() {
+    let narrow = ActionLimits { low: [0.3; ACTION_LEN], high: [0.4; ACTION_LEN] };
+    let after_swap = |value| {
+        after_one(Setup { rate_max: Some(0.1), ..setup() }, |judge| {
+            judge.runs_with(known(narrow));
+            hear(judge, &message(2));
+            send(judge, action(2, ActionSource::Policy, value), at_ns(2));
+        })
+    };
+    assert_eq!(after_swap(0.15), Some("out of limits"));
+    assert_eq!(after_swap(0.3), None);
+}
+
+#[test]
+fn what_cannot_be_the_policy_s_is_not_marked_so() {
+    assert_eq!(answer_to_two(0.1, |_, second| second.reward = f32::NAN), Some("marked"));
+    assert_eq!(answer_to_two(0.1, |_, second| second.executed_action[0] = 3e38), Some("marked"));
+    let fallback = after_one(setup(), |judge| {
+        hear(judge, &message(2));
+        send(judge, action(2, ActionSource::Fallback, 0.1), at_ns(2));
+    });
+    assert_eq!(fallback, Some("marked"));
+}
+
+#[test]
+fn a_fallback_is_the_one_that_was_asked_for() {
+    let held = |value| {
+        after_one(setup(), |judge| {
+            let mut second = message(2);
+            (second.reward, second.executed_action) = (f32::NAN, [0.1; ACTION_LEN]);
+            hear(judge, &second);
+            send(judge, action(2, ActionSource::Fallback, value), at_ns(2));
+        })
+    };
+    assert_eq!((held(0.1), held(0.0)), (None, Some("fallback")));
+}
+
+#[test]
+fn an_answer_to_anything_but_the_newest_message_is_stale() {
+    let stale = after_one(setup(), |judge| {
+        hear(judge, &message(3));
+        send(judge, action(1, ActionSource::Policy, 0.1), at_ns(3));
+    });
+    assert_eq!(stale, Some("stale"));
+    let overtaken = after_one(setup(), |judge| {
+        hear(judge, &message(2));
+        let newer = Heard::new(1, &message(4), 0);
+        judge.sent(&action(2, ActionSource::Policy, 0.1), Some(&newer), at_ns(4), at_ns(4));
+    });
+    assert_eq!(overtaken, Some("overtaken"));
+}
+
+#[test]
+fn a_message_that_is_not_answered_and_a_stand_in_that_does_not_come_are_seen() {
+    let unanswered = after_one(setup(), |judge| {
+        hear(judge, &message(2));
+        judge.looks_at_link(at_ns(2), true);
+    });
+    assert_eq!(unanswered, Some("not answered"));
+    let missing = after_one(setup(), |judge| {
+        judge.looked(at_ns(3));
+        (0..=LOOKS_MAX).for_each(|_| judge.looks_at_link(at_ns(3), false));
+    });
+    assert_eq!(missing, Some("no stand-in"));
+}
+
+#[test]
+fn a_clock_that_is_ahead_puts_no_stand_in_off() {
+    let mut ahead = message(1);
+    (ahead.scheduled_ns, ahead.published_ns) = (u64::MAX, u64::MAX);
+    let mut judge = judge(setup());
+    hear(&mut judge, &ahead);
+    send(&mut judge, action(1, ActionSource::Policy, 0.1), at_ns(1));
+    judge.looked(at_ns(3));
+    (0..=LOOKS_MAX).for_each(|_| judge.looks_at_link(at_ns(3), false));
+    assert_eq!(judge.violation.map(|violation| violation.kind), Some("no stand-in"));
+}
+
+#[test]
+fn stand_ins_come_in_time_marked_and_no_more_often_than_allowed() {
+    let stand_in = |source, ticks: u64, now_ns| {
+        after_one(setup(), |judge| {
+            (2..=ticks)
+                .for_each(|sequence| send(judge, action(sequence, source, 0.1), now_ns + at_ns(sequence)));
+        })
+    };
+    assert_eq!(stand_in(ActionSource::Imagined, 2, PERIOD_NS), None);
+    assert_eq!(stand_in(ActionSource::Imagined, 2, 0), Some("stand-in"));
+    assert_eq!(stand_in(ActionSource::Policy, 2, PERIOD_NS), Some("marked"));
+    assert_eq!(stand_in(ActionSource::Imagined, 3, PERIOD_NS), Some("too many"));
+    assert_eq!(stand_in(ActionSource::Fallback, 4, PERIOD_NS), Some("too many"));
+}
+
+#[test]
+fn counts_that_are_not_the_wire_s_are_seen() {
+    let mut judge = judge(setup());
+    hear(&mut judge, &message(1));
+    send(&mut judge, action(1, ActionSource::Policy, 0.1), at_ns(1));
+    let counters = Counters { observations: 1, answers: 1, ..Counters::default() };
+    judge.check_counters(&counters, 0);
+    assert!(judge.violation.is_none(), "{:?}", judge.violation);
+    judge.check_counters(&Counters { answers: 2, ..counters }, 0);
+    assert_eq!(judge.violation.map(|violation| violation.kind), Some("counters"));
+}
