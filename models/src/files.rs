@@ -36,12 +36,48 @@ pub enum FileError {
         /// The path.
         path: PathBuf,
     },
+    /// The file that is to be replaced is of another kind.
+    #[error("{path} holds something else than {expected}, which would be lost; choose another file")]
+    OtherKind {
+        /// The file.
+        path: PathBuf,
+        /// What is to be written.
+        expected: Output,
+    },
     /// The file is there and must not be written over.
     #[error("{path} exists already and is not written over; remove it, or choose another place")]
     Exists {
         /// The file.
         path: PathBuf,
     },
+}
+
+/// What a verb writes where it is told to.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum Output {
+    /// A result as JSON.
+    Json,
+    /// A picture as PNG.
+    Png,
+}
+
+impl std::fmt::Display for Output {
+    fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
+        f.write_str(match self {
+            Self::Json => "JSON",
+            Self::Png => "a PNG picture",
+        })
+    }
+}
+
+impl Output {
+    /// Whether a file that begins like this may be one.
+    fn is_like(self, begin: &[u8]) -> bool {
+        match self {
+            Self::Json => matches!(begin.trim_ascii_start().first(), None | Some(b'{' | b'[')),
+            Self::Png => begin.is_empty() || begin.starts_with(b"\x89PNG"),
+        }
+    }
 }
 
 impl FileError {
@@ -145,12 +181,14 @@ fn folder_of(path: &Path) -> PathBuf {
 }
 
 /// Makes sure, before long work begins, that a file can be written there when it is done: its folder is made where it is missing, and a
-/// path that is a folder, or where nothing can be written, is an error now. `-` is standard output.
+/// path that is a folder, or where nothing can be written, is an error now. An older result may be replaced, a file of another kind may
+/// not. `-` is standard output, which is kept for it from now on.
 ///
 /// # Errors
-/// [`FileError::NotAFile`] or [`FileError::Io`].
-pub fn prepare_output(path: &Path) -> Result<(), FileError> {
+/// [`FileError::NotAFile`], [`FileError::OtherKind`] or [`FileError::Io`].
+pub fn prepare_output(path: &Path, output: Output) -> Result<(), FileError> {
     if path == Path::new("-") {
+        crate::terminal::keep_for_result();
         return Ok(());
     }
     match fs::metadata(path) {
@@ -159,9 +197,27 @@ pub fn prepare_output(path: &Path) -> Result<(), FileError> {
         _ => {}
     }
     let path = fs::canonicalize(path).unwrap_or_else(|_| path.to_path_buf());
+    if let Ok(file) = File::open(&path) {
+        let mut begin = Vec::new();
+        file.take(64).read_to_end(&mut begin).map_err(FileError::io(&path))?;
+        if !output.is_like(&begin) {
+            return Err(FileError::OtherKind { path, expected: output });
+        }
+    }
     let folder = folder_of(&path);
     fs::create_dir_all(&folder).map_err(FileError::io(&folder))?;
     tempfile::Builder::new().prefix(".writing-").tempfile_in(&folder).map(drop).map_err(FileError::io(&path))
+}
+
+/// Writes what [`prepare_output`] has prepared: atomically to a file, or to standard output.
+///
+/// # Errors
+/// [`FileError::Io`].
+pub fn write_output(path: &Path, bytes: &[u8]) -> Result<(), FileError> {
+    if path == Path::new("-") {
+        return crate::terminal::print_result(bytes).map_err(FileError::io(Path::new("standard output")));
+    }
+    write_atomic(path, bytes)
 }
 
 /// The first of `name.ext`, `name-2.ext`, `name-3.ext`, ... for which `is_free` holds.
@@ -272,14 +328,29 @@ mod tests {
     fn an_output_is_found_unwritable_before_the_work() {
         let folder = tempfile::tempdir().unwrap();
         let path = folder.path().join("not/yet/there/a.json");
-        prepare_output(&path).unwrap();
+        prepare_output(&path, Output::Json).unwrap();
         write_atomic(&path, b"{}").unwrap();
-        prepare_output(&path).unwrap();
+        prepare_output(&path, Output::Json).unwrap();
         assert_eq!(fs::read(&path).unwrap(), b"{}", "what is there is not touched");
-        assert!(matches!(prepare_output(folder.path()), Err(FileError::NotAFile { .. })));
-        let error = prepare_output(&path.join("below/a.json")).unwrap_err().to_string();
+        let json = |path: &Path| prepare_output(path, Output::Json);
+        assert!(matches!(json(folder.path()), Err(FileError::NotAFile { .. })));
+        let error = json(&path.join("below/a.json")).unwrap_err().to_string();
         assert!(error.contains("a.json"), "{error}");
-        prepare_output("/dev/null".as_ref()).unwrap();
+        json("/dev/null".as_ref()).unwrap();
+    }
+
+    #[test]
+    fn a_result_never_replaces_a_file_of_another_kind() {
+        let folder = tempfile::tempdir().unwrap();
+        let path = folder.path().join("manifest.toml");
+        write_atomic(&path, b"format = 1").unwrap();
+        for output in [Output::Json, Output::Png] {
+            let error = prepare_output(&path, output).unwrap_err();
+            assert!(matches!(error, FileError::OtherKind { .. }), "{error}");
+        }
+        write_atomic(&path, b"\x89PNG\r\n").unwrap();
+        prepare_output(&path, Output::Png).unwrap();
+        assert!(prepare_output(&path, Output::Json).is_err());
     }
 
     #[test]

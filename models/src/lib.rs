@@ -11,6 +11,7 @@
 //! | [`tensors`] | named arrays in safetensors files |
 //! | [`errors`] | errors as one line for people |
 //! | [`files`] | atomic writes, checksums, capped reads |
+//! | [`help`] | the examples of a help text |
 //! | [`lock`] | one writer a folder |
 //! | [`terminal`] | printing that survives a closed pipe and a full disk; lines of progress without a terminal |
 //!
@@ -20,6 +21,7 @@ pub mod bundle;
 pub mod episode;
 pub mod errors;
 pub mod files;
+pub mod help;
 pub mod lock;
 pub mod onnx;
 pub mod settings;

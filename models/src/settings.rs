@@ -28,7 +28,7 @@ pub enum Preset {
     Paper,
 }
 
-/// The sizes of a model. `n` categoricals of `m` classes, deterministic width `d` (spec, section 1).
+/// The sizes of a model. `n` categoricals of `m` classes, deterministic width `d`.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct ModelSettings {

@@ -6,15 +6,35 @@ use std::io::{self, Write};
 use std::sync::atomic::{AtomicBool, AtomicI32, Ordering};
 use std::sync::mpsc::{RecvTimeoutError, Sender, channel};
 use std::thread::JoinHandle;
-use std::time::Duration;
+use std::time::{Duration, Instant};
 
 /// Nobody reads standard output any more.
 static CLOSED: AtomicBool = AtomicBool::new(false);
 /// The first error of writing to standard output, as the system numbers it; 0 for none.
 static LOST: AtomicI32 = AtomicI32::new(0);
 
+/// Standard output is for a result that a program reads.
+static KEPT: AtomicBool = AtomicBool::new(false);
+
+/// Keeps standard output for [`print_result`]; what is for people goes to standard error from now on.
+pub fn keep_for_result() {
+    KEPT.store(true, Ordering::Relaxed);
+}
+
+/// Prints a result that a program reads to standard output.
+///
+/// # Errors
+/// Those of writing, a closed pipe included.
+pub fn print_result(bytes: &[u8]) -> io::Result<()> {
+    let mut out = io::stdout().lock();
+    out.write_all(bytes).and_then(|()| out.flush())
+}
+
 /// Prints to standard output, as `print!` does; for [`out!`](crate::out).
 pub fn print(text: Arguments<'_>) {
+    if KEPT.load(Ordering::Relaxed) {
+        return print_error(text);
+    }
     if CLOSED.load(Ordering::Relaxed) {
         return;
     }
@@ -97,6 +117,24 @@ impl Heartbeat {
     }
 }
 
+impl Heartbeat {
+    /// Says every [`LINE_EVERY`] how far a work is that is called `what` and whose parts are called `unit`, by what `read` gives: how much
+    /// is done, of how much if that is known, and what else there is to say.
+    #[must_use]
+    pub fn of_work(
+        what: &'static str,
+        unit: &'static str,
+        read: impl Fn() -> (u64, Option<u64>, String) + Send + 'static,
+    ) -> Self {
+        let (begin, (before, ..)) = (Instant::now(), read());
+        Self::start(LINE_EVERY, move || {
+            let (done, all, more) = read();
+            let line = progress_line(what, (before, done, all), unit, begin.elapsed());
+            Some(if more.is_empty() { line } else { format!("{line}; {more}") })
+        })
+    }
+}
+
 impl Drop for Heartbeat {
     fn drop(&mut self) {
         self.end = None;
@@ -107,18 +145,25 @@ impl Drop for Heartbeat {
     }
 }
 
-/// `done` of `all` units of a work after so much time: how many, how fast, and how long it will take still.
+/// `done` of `all` units of a work, of which `before` were done before, after so much time: how many, how fast, and how long it will
+/// take still.
 #[must_use]
-pub fn progress_line(what: &str, done: u64, all: Option<u64>, unit: &str, time: Duration) -> String {
-    let per_s = done as f64 / time.as_secs_f64().max(1e-9);
+pub fn progress_line(
+    what: &str,
+    (before, done, all): (u64, u64, Option<u64>),
+    unit: &str,
+    time: Duration,
+) -> String {
+    let made = done.saturating_sub(before);
+    let per_s = made as f64 / time.as_secs_f64().max(1e-9);
     let begin = if what.is_empty() { String::new() } else { format!("{what}: ") };
-    let rate = if per_s >= 1.0 || done == 0 {
+    let rate = if per_s >= 1.0 || made == 0 {
         format!("{per_s:.1} a second")
     } else {
         format!("{:.1} s each", 1.0 / per_s)
     };
     match all {
-        Some(all) if done > 0 => {
+        Some(all) if made > 0 => {
             let left_s = all.saturating_sub(done) as f64 / per_s;
             format!("{begin}{done} of {all} {unit}, {rate}, ETA {}", duration(left_s))
         }
@@ -142,11 +187,16 @@ mod tests {
 
     #[test]
     fn a_line_of_progress_tells_how_far_how_fast_and_how_long() {
-        let line = |done, all, s| progress_line("measuring", done, all, "ticks", Duration::from_secs(s));
+        let line = |done, all, s| progress_line("measuring", (0, done, all), "ticks", Duration::from_secs(s));
         assert_eq!(line(50, Some(200), 25), "measuring: 50 of 200 ticks, 2.0 a second, ETA 75 s");
         assert_eq!(line(5, Some(200), 50), "measuring: 5 of 200 ticks, 10.0 s each, ETA 32 min");
         assert_eq!(line(0, Some(200), 30), "measuring: 0 of 200 ticks after 30 s");
         assert_eq!(line(50, None, 25), "measuring: 50 ticks, 2.0 a second");
+        let resumed = progress_line("", (100, 150, Some(200)), "updates", Duration::from_secs(25));
+        assert_eq!(
+            resumed, "150 of 200 updates, 2.0 a second, ETA 25 s",
+            "only what was done now tells the pace"
+        );
     }
 
     #[test]

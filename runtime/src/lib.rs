@@ -24,7 +24,7 @@
 //! ```no_run
 //! use rcwm_runtime::{EngineSettings, Policy};
 //!
-//! let mut policy = Policy::load("models/bundles/debug".as_ref(), EngineSettings::tract())?;
+//! let mut policy = Policy::load("models/bundles/hammer".as_ref(), EngineSettings::tract())?;
 //! let image = vec![0_u8; rcwm_models::IMAGE_BYTES]; // 64 x 64 x 3, upright, RGB
 //! let mut executed = None; // nothing yet: an episode starts
 //! for _ in 0..250 {

@@ -90,13 +90,20 @@ fn a_path_out_of_the_bundle_is_refused() {
     }
 }
 
+/// Stores of large files give links; what they lead to is checked as if it lay there.
 #[test]
-fn a_link_in_place_of_a_part_is_refused() {
-    let folder = changed(|folder| {
-        fs::remove_file(folder.join("robot.onnx")).unwrap();
-        std::os::unix::fs::symlink(shipped_bundle().join("robot.onnx"), folder.join("robot.onnx")).unwrap();
-    });
-    assert_refused(folder.path(), &["robot.onnx", "not a plain file"]);
+fn a_link_in_place_of_a_part_is_read_and_one_to_no_file_is_refused() {
+    let linked = |to: &Path| {
+        let to = to.to_path_buf();
+        changed(move |folder| {
+            fs::remove_file(folder.join("robot.onnx")).unwrap();
+            std::os::unix::fs::symlink(to, folder.join("robot.onnx")).unwrap();
+        })
+    };
+    let folder = linked(&shipped_bundle().join("robot.onnx"));
+    rcwm_models::bundle::Bundle::open(folder.path()).unwrap();
+    assert_refused(linked(&shipped_bundle().join("actor.onnx")).path(), &["robot.onnx"]);
+    assert_refused(linked(Path::new("/dev/zero")).path(), &["robot.onnx", "not a plain file"]);
 }
 
 #[test]

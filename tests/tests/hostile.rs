@@ -1,4 +1,5 @@
 //! A hostile peer for some thousand messages; `hostile-peer` does as many as are asked for.
+#![allow(clippy::unwrap_used, reason = "a test may panic")]
 
 use rcwm_tests::{Domain, output, read_json, shipped_bundle};
 

@@ -49,6 +49,14 @@ pub enum CheckpointError {
         /// The folder.
         path: PathBuf,
     },
+    /// There is none at the path, and none of a run either.
+    #[error("checkpoint: {path}: {reason}")]
+    NoCheckpoint {
+        /// The path.
+        path: PathBuf,
+        /// What is there, and what was expected.
+        reason: String,
+    },
     /// The settings are unusable.
     #[error("checkpoint: {0}")]
     Settings(#[from] SettingsError),
@@ -169,11 +177,75 @@ impl Checkpoint {
             .map_err(|source| CheckpointError::Folder { path: folder.to_path_buf(), source })
     }
 
-    /// Reads a checkpoint: exactly the parameters that its settings ask for, of their shapes, all finite.
+    /// The folder of the checkpoint that a path means: itself, one of its files' folder, or the newest one of a run's folder.
+    ///
+    /// # Errors
+    /// [`CheckpointError::NoCheckpoint`] says what is there instead.
+    pub fn locate(path: &Path) -> Result<PathBuf, CheckpointError> {
+        let has_one = |folder: &Path| folder.join(SETTINGS_FILE).is_file();
+        let within = ["", "checkpoints/last", "last"].into_iter().map(|place| match place {
+            "" => path.to_path_buf(),
+            place => path.join(place),
+        });
+        if let Some(found) = within.into_iter().find(|folder| has_one(folder)) {
+            return Ok(found);
+        }
+        let refuse = |reason: &str| {
+            Err(CheckpointError::NoCheckpoint { path: path.to_path_buf(), reason: reason.to_owned() })
+        };
+        let name = path.file_name().unwrap_or_default().to_string_lossy();
+        match path.parent() {
+            Some(folder) if path.is_file() && has_one(folder) && name != SETTINGS_FILE => {
+                // One of several files of weights would be another checkpoint than its folder's.
+                return refuse("a file of a checkpoint; name its folder");
+            }
+            Some(folder) if path.is_file() && name == SETTINGS_FILE => return Ok(folder.to_path_buf()),
+            _ => {}
+        }
+        if path.is_file() {
+            return match path.extension().is_some_and(|ending| ending == "pt" || ending == "pth") {
+                true => {
+                    refuse("a file of PyTorch, which is not read; expected a folder with checkpoint.toml")
+                }
+                false => refuse("a file; expected a folder with checkpoint.toml, or the folder of a run"),
+            };
+        }
+        if !path.exists() {
+            return refuse("no such folder; expected one with checkpoint.toml, or the folder of a run");
+        }
+        if path.join("manifest.toml").is_file() {
+            return refuse(
+                "a bundle, which is for rcwm-runtime; expected the checkpoint it was exported from",
+            );
+        }
+        if path.join("settings.toml").is_file() {
+            return refuse("a run that has saved no checkpoint yet");
+        }
+        if path.join("seed-0").is_dir() {
+            return refuse("the runs of several seeds; name one of its folders");
+        }
+        refuse("no checkpoint.toml there, and none in checkpoints/last either")
+    }
+
+    /// Reads a checkpoint, of a run the newest ([`Checkpoint::locate`]): exactly the parameters that its settings ask for, of their
+    /// shapes, all finite.
     ///
     /// # Errors
     /// See [`CheckpointError`].
-    pub fn read(folder: &Path, device: &Device) -> Result<Self, CheckpointError> {
+    pub fn read(path: &Path, device: &Device) -> Result<Self, CheckpointError> {
+        let folder = Self::locate(path)?;
+        let stored = || std::fs::read(folder.join(SETTINGS_FILE)).ok();
+        loop {
+            let before = stored();
+            let read = Self::read_from(&folder, device);
+            // A run that saves a newer one meanwhile has removed the weights that were asked for.
+            if read.is_ok() || stored() == before {
+                return read;
+            }
+        }
+    }
+
+    fn read_from(folder: &Path, device: &Device) -> Result<Self, CheckpointError> {
         let settings: CheckpointSettings = rcwm_models::settings::read(&folder.join(SETTINGS_FILE))?;
         if settings.format != FORMAT {
             return Err(CheckpointError::Format { found: settings.format });

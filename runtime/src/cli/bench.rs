@@ -12,7 +12,7 @@ use crate::telemetry::LatencyFiles;
 /// Arguments of `bench`.
 #[derive(Debug, Args)]
 #[command(
-    after_help = "Example:\n  rcwm-runtime bench --bundle models/bundles/paper --engine all --ticks 2000 --json b.json"
+    after_help = "Example:\n  rcwm-runtime bench --bundle models/bundles/hammer --engine all --ticks 2000 --json b.json"
 )]
 pub(super) struct BenchArguments {
     /// The bundle's folder
@@ -25,7 +25,7 @@ pub(super) struct BenchArguments {
     #[arg(long, value_name = "N", default_value_t = 2000, value_parser = clap::value_parser!(u64).range(1..=100_000_000))]
     ticks: u64,
     /// Measures tract from the exported parts to what is deployed, one optimisation at a time, in place of the engines
-    #[arg(long)]
+    #[arg(long, conflicts_with = "engine")]
     ladder: bool,
     /// Measures with SCHED_FIFO of this priority and locked memory, as `run --realtime` does
     #[arg(long, value_name = "PRIORITY", num_args = 0..=1, default_missing_value = "50",
@@ -39,6 +39,8 @@ pub(super) struct BenchArguments {
 }
 
 pub(super) fn run(arguments: &BenchArguments) -> anyhow::Result<()> {
+    super::prepare_json(arguments.json.as_deref())?;
+    arguments.files.prepare()?;
     let bundle = super::open_bundle(&arguments.bundle)?;
     let (kinds, left_out) = arguments.engine.engines()?;
     let mut cases = crate::bench::engines(&kinds);
@@ -48,7 +50,7 @@ pub(super) fn run(arguments: &BenchArguments) -> anyhow::Result<()> {
     let stop = super::stop_flag()?;
     let ticks = arguments.ticks as usize;
     let real_time = arguments.realtime.map(|priority| Request { priority: Some(priority), cpu: None });
-    let bar = super::progress_bar(ticks + ticks / 10, "measuring");
+    let bar = super::progress_bar(ticks + ticks / 10, "measuring", "ticks");
     let mut rounds: u64 = 0;
     let measured = crate::bench::bench(&bundle, &cases, ticks, real_time, &mut || {
         rounds += 1;
@@ -60,11 +62,12 @@ pub(super) fn run(arguments: &BenchArguments) -> anyhow::Result<()> {
     })?;
     bar.finish_and_clear();
     let report = &measured.report;
-    print!("{}", if arguments.ladder { report.steps_text() } else { report.text() });
-    if let Some(reason) = left_out {
-        println!("engine ort not measured: {reason}");
-    }
     measured.write(&arguments.files)?;
-    print!("{}", arguments.files.lines());
-    super::write_json(arguments.json.as_ref(), report)
+    super::write_json(arguments.json.as_deref(), report)?;
+    rcwm_models::out!("{}", if arguments.ladder { report.steps_text() } else { report.text() });
+    if let Some(reason) = left_out {
+        rcwm_models::outln!("engine ort not measured: {reason}");
+    }
+    rcwm_models::out!("{}", arguments.files.lines());
+    Ok(())
 }

@@ -6,7 +6,7 @@ use clap::Args;
 
 /// Arguments of `inspect`.
 #[derive(Debug, Args)]
-#[command(after_help = "Example:\n  rcwm-runtime inspect --bundle models/bundles/debug --json inspect.json")]
+#[command(after_help = "Example:\n  rcwm-runtime inspect --bundle models/bundles/hammer --json inspect.json")]
 pub(super) struct InspectArguments {
     /// The bundle's folder
     #[arg(long, value_name = "DIR")]
@@ -17,8 +17,10 @@ pub(super) struct InspectArguments {
 }
 
 pub(super) fn run(arguments: &InspectArguments) -> anyhow::Result<()> {
+    super::prepare_json(arguments.json.as_deref())?;
     let bundle = super::open_bundle(&arguments.bundle)?;
     let info = crate::inspect::inspect(&bundle)?;
-    print!("{}", info.text());
-    super::write_json(arguments.json.as_ref(), &info)
+    super::write_json(arguments.json.as_deref(), &info)?;
+    rcwm_models::out!("{}", info.text());
+    Ok(())
 }

@@ -6,11 +6,14 @@
 //! | 1 | an error: one line on stderr says which, and what to do; or a bundle that does not verify, a replay that differs |
 //! | 2 | the command line was not understood |
 //! | 3 | no observation came within --timeout |
+//! | 4 | stopped: the policy was unfit for --fallback-ticks-max ticks |
+//! | 5 | the peer was silent for --silence-max |
 //! | 130 | ended at once by a second Ctrl-C |
 
 mod bench;
 mod inspect;
 mod observers;
+mod remarks;
 mod replay;
 mod run;
 mod safety;
@@ -19,7 +22,7 @@ mod swap;
 mod telemetry;
 mod verify;
 
-use std::path::{Path, PathBuf};
+use std::path::Path;
 use std::process::ExitCode;
 use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, Ordering};
@@ -29,6 +32,8 @@ use anyhow::Context;
 use clap::{Parser, Subcommand, ValueEnum};
 use rcwm_models::bundle::Bundle;
 use rcwm_models::errors::one_line;
+use rcwm_models::files::{Output, prepare_output, write_output};
+use rcwm_models::terminal::Heartbeat;
 use serde::Serialize;
 
 use crate::controller::ControllerError;
@@ -71,12 +76,12 @@ struct Arguments {
 
 const EXAMPLES: &str = "\
 Examples:
-  rcwm-runtime inspect --bundle models/bundles/debug
-  rcwm-runtime verify --bundle models/bundles/debug
-  rcwm-runtime run --bundle models/bundles/debug --instance demo --record runs/demo --json runs/demo.json
-  rcwm-runtime swap --instance demo --bundle models/bundles/debug --now
-  rcwm-runtime bench --bundle models/bundles/debug --engine all --ticks 2000
-  rcwm-runtime replay --log runs/demo.rcwmlog --bundle models/bundles/debug
+  rcwm-runtime inspect --bundle models/bundles/hammer
+  rcwm-runtime verify --bundle models/bundles/hammer
+  rcwm-runtime run --bundle models/bundles/hammer --instance demo --record runs/demo --json runs/demo.json
+  rcwm-runtime swap --instance demo --bundle models/bundles/hammer --now
+  rcwm-runtime bench --bundle models/bundles/hammer --engine all --ticks 2000
+  rcwm-runtime replay --log runs/demo.rcwmlog --bundle models/bundles/hammer
 
 Exit codes:
   0 done (also after Ctrl-C), 1 error or not verified, 2 usage, 3 no observation within --timeout, 4 stopped: the policy
@@ -145,16 +150,16 @@ pub fn main() -> ExitCode {
         Verb::Replay(arguments) => replay::run(&arguments),
         Verb::Telemetry(arguments) => telemetry::run(&arguments),
     };
-    let code = result.map_or_else(
-        |error| {
-            eprintln!("error: {}", one_line(error.as_ref()));
+    // What standard output has lost is an error, too, but not the first to be told.
+    let told = || rcwm_models::terminal::finish().context("standard output");
+    let code = match result.and_then(|()| told()) {
+        Ok(()) => 0,
+        Err(error) => {
+            rcwm_models::errln!("error: {}", one_line(error.as_ref()));
             Exit::from(&error) as u8
-        },
-        |()| 0,
-    );
+        }
+    };
     if crate::swap::desk_is_left() {
-        // What this prints has gone out by lines; a pipe that is closed has nobody to be told.
-        let _ = std::io::Write::flush(&mut std::io::stdout());
         // SAFETY: ends the process; nothing of it is used afterwards.
         unsafe { libc::_exit(i32::from(code)) }
     }
@@ -162,6 +167,16 @@ pub fn main() -> ExitCode {
 }
 
 fn open_bundle(folder: &Path) -> anyhow::Result<Bundle> {
+    if folder.is_file() {
+        anyhow::bail!("{} is a file; expected the folder of a bundle, with manifest.toml", folder.display());
+    }
+    let checkpoint = ["", "checkpoints/last"].map(|place| folder.join(place).join("checkpoint.toml"));
+    if !folder.join("manifest.toml").exists() && checkpoint.iter().any(|file| file.is_file()) {
+        anyhow::bail!(
+            "{} is a checkpoint of the trainer, no bundle; `rcwm-trainer export --checkpoint {0} --out BUNDLE` makes one",
+            folder.display()
+        );
+    }
     if !folder.is_dir() {
         anyhow::bail!(
             "no bundle at {}: no such folder; `rcwm-trainer export --checkpoint DIR --out {}` makes one",
@@ -179,15 +194,17 @@ fn seconds(text: &str) -> Result<f64, String> {
     }
 }
 
-fn write_json(path: Option<&PathBuf>, report: &impl Serialize) -> anyhow::Result<()> {
+/// Makes sure before the work that its result can be written.
+fn prepare_json(path: Option<&Path>) -> anyhow::Result<()> {
+    let Some(path) = path else { return Ok(()) };
+    prepare_output(path, Output::Json).context("--json")
+}
+
+fn write_json(path: Option<&Path>, report: &impl Serialize) -> anyhow::Result<()> {
     let Some(path) = path else { return Ok(()) };
     let mut json = serde_json::to_vec_pretty(report).context("writing JSON")?;
     json.push(b'\n');
-    if let Some(folder) = path.parent().filter(|folder| !folder.as_os_str().is_empty()) {
-        std::fs::create_dir_all(folder).with_context(|| format!("{}", folder.display()))?;
-    }
-    rcwm_models::files::write_atomic(path, &json)?;
-    Ok(())
+    write_output(path, &json).context("--json")
 }
 
 /// Signals this close together are one: supervisors and `timeout` signal a process, then its whole group.
@@ -208,8 +225,82 @@ fn stop_flag() -> anyhow::Result<Arc<AtomicBool>> {
     Ok(stop)
 }
 
-fn progress_bar(len: usize, what: &'static str) -> indicatif::ProgressBar {
+/// A bar; where no terminal shows it, a line every so often says how far the work is.
+struct Bar {
+    bar: indicatif::ProgressBar,
+    _lines: Option<Heartbeat>,
+}
+
+impl std::ops::Deref for Bar {
+    type Target = indicatif::ProgressBar;
+    fn deref(&self) -> &Self::Target {
+        &self.bar
+    }
+}
+
+fn progress_bar(len: usize, what: &'static str, unit: &'static str) -> Bar {
     let style = indicatif::ProgressStyle::with_template("{msg} {wide_bar} {pos}/{len} {elapsed}")
         .unwrap_or_else(|_| indicatif::ProgressStyle::default_bar());
-    indicatif::ProgressBar::new(len as u64).with_style(style).with_message(what)
+    let bar = indicatif::ProgressBar::new(len as u64).with_style(style).with_message(what);
+    let lines = bar.is_hidden().then(|| {
+        let bar = bar.clone();
+        let length = |bar: &indicatif::ProgressBar| bar.length().filter(|all| *all > 0);
+        Heartbeat::of_work(what, unit, move || (bar.position(), length(&bar), String::new()))
+    });
+    Bar { bar, _lines: lines }
+}
+
+#[cfg(test)]
+mod tests {
+    use clap::CommandFactory;
+    use rcwm_models::help::{examples, missing_file};
+
+    use super::*;
+
+    /// The help texts of the program and of all its verbs.
+    fn help_texts() -> Vec<String> {
+        let command = Arguments::command();
+        let all = std::iter::once(command.clone()).chain(command.get_subcommands().cloned());
+        all.map(|mut command| command.render_long_help().ansi().to_string()).collect()
+    }
+
+    #[test]
+    fn every_example_is_understood_and_names_files_that_are_shipped() {
+        let root = std::path::Path::new(env!("CARGO_MANIFEST_DIR")).join("..");
+        let found: Vec<_> = help_texts().iter().flat_map(|text| examples(text, "rcwm-runtime")).collect();
+        assert!(found.len() > 10, "{found:?}");
+        for example in found {
+            let parsed = Arguments::try_parse_from(&example);
+            assert!(
+                parsed.is_ok(),
+                "{example:?}: {}",
+                parsed.err().map_or_else(String::new, |e| e.to_string())
+            );
+            assert_eq!(missing_file(&example, &root), None, "{example:?}");
+        }
+    }
+
+    #[test]
+    fn options_that_would_be_ignored_are_refused() {
+        for refused in [
+            "run --bundle b --instance a --seed 3",
+            "run --bundle b --instance a --record-episodes 2",
+            "run --bundle b --instance a --telemetry-every 2s",
+            "run --bundle b --instance a --realtime-priority 20",
+            "bench --bundle b --ladder --engine ort",
+            "replay --log l --episodes e --engine tract",
+        ] {
+            let words = std::iter::once("program").chain(refused.split_whitespace());
+            assert!(Arguments::try_parse_from(words).is_err(), "{refused}");
+        }
+        for taken in [
+            "run --bundle b --instance a --sample --seed 3",
+            "run --bundle b --instance a --record r --record-episodes 2",
+            "bench --bundle b --ladder",
+            "replay --log l --bundle b --engine tract",
+        ] {
+            let words = std::iter::once("program").chain(taken.split_whitespace());
+            assert!(Arguments::try_parse_from(words).is_ok(), "{taken}");
+        }
+    }
 }

@@ -1,13 +1,15 @@
 //! What looks on while `run` goes on, and what it leaves behind: films, a log, snapshots, latencies.
 
-use std::path::PathBuf;
+use std::path::{Path, PathBuf};
 use std::time::Duration;
 
+use anyhow::Context;
 use clap::Args;
 use rcwm_models::bundle::Bundle;
+use rcwm_models::files::free_name;
 
 use crate::controller::{Pace, RunReport, TickObserver};
-use crate::log::{LogSettings, LogSummary, Logger};
+use crate::log::{LogError, LogSettings, LogSummary, Logger};
 use crate::policy::Policy;
 use crate::record::{Recorded, Recorder};
 use crate::telemetry::{LatencyFiles, SnapshotSettings, Snapshots, Telemetry};
@@ -19,16 +21,16 @@ pub(super) struct ObserverArguments {
     #[arg(long, value_name = "DIR")]
     record: Option<PathBuf>,
     /// Records at most this many episodes
-    #[arg(long, value_name = "N", default_value_t = 3)]
+    #[arg(long, value_name = "N", default_value_t = 3, requires = "record")]
     record_episodes: u64,
-    /// Logs every tick to this file, for `rcwm-runtime replay`; it must not exist yet
+    /// Logs every tick to this file, for `rcwm-runtime replay`; where it exists, to another: FILE-2, FILE-3, ...
     #[arg(long, value_name = "FILE")]
     log: Option<PathBuf>,
     /// Appends a JSON line to this file every so often: counts, latencies and surprise of the last interval and in total
     #[arg(long, value_name = "FILE")]
     telemetry: Option<PathBuf>,
     /// Time between two of these lines, as in 500ms, 1s or 2m
-    #[arg(long, value_name = "TIME", default_value = "1s", value_parser = interval)]
+    #[arg(long, value_name = "TIME", default_value = "1s", requires = "telemetry", value_parser = interval)]
     telemetry_every: Duration,
     #[command(flatten)]
     latency_files: LatencyFiles,
@@ -64,9 +66,58 @@ pub(super) struct Left {
 }
 
 impl ObserverArguments {
+    /// Makes sure before the run that everything can be written, and each to a file of its own.
+    pub(super) fn prepare(&self, json: Option<&Path>) -> anyhow::Result<()> {
+        super::prepare_json(json)?;
+        self.latency_files.prepare()?;
+        for (option, file) in [("--log", &self.log), ("--telemetry", &self.telemetry)] {
+            let folder =
+                file.as_deref().and_then(Path::parent).filter(|folder| !folder.as_os_str().is_empty());
+            if let Some(folder) = folder {
+                std::fs::create_dir_all(folder).with_context(|| format!("{option} {}", folder.display()))?;
+            }
+        }
+        let plot = self.latency_files.plot.as_deref();
+        let files = [
+            ("--json", json),
+            ("--log", self.log.as_deref()),
+            ("--telemetry", self.telemetry.as_deref()),
+            ("--plot", plot),
+        ];
+        let named: Vec<_> =
+            files.iter().filter_map(|(option, file)| Some((*option, file.as_ref()?))).collect();
+        for (index, (option, file)) in named.iter().enumerate() {
+            if let Some((other, _)) = named[..index].iter().find(|(_, other)| other == file) {
+                anyhow::bail!("{other} and {option} name one file, {}; each needs its own", file.display());
+            }
+        }
+        Ok(())
+    }
+
     /// Whether films and episodes are asked for.
     pub(super) fn records(&self) -> bool {
         self.record.is_some()
+    }
+}
+
+/// Starts a log; one that is there stays as it is, so that a run that is started again after a crash comes back.
+fn start_log(file: &Path, policy: &Policy, log: &LogSettings) -> Result<Logger, LogError> {
+    if file.exists() && !file.is_file() {
+        let source = std::io::Error::other("a folder or a device; expected the name of a new file");
+        return Err(LogError::Io { path: file.to_path_buf(), source });
+    }
+    loop {
+        let free = free_name(file, |name| !name.exists());
+        match Logger::start(&free, policy, log.clone()) {
+            // Another run was faster; the next name.
+            Err(LogError::Exists { .. }) => {}
+            started => {
+                if free != file {
+                    rcwm_models::errln!("{} is kept; this run's log is {}", file.display(), free.display());
+                }
+                return started;
+            }
+        }
     }
 }
 
@@ -82,7 +133,7 @@ impl Observers {
             None => None,
         };
         let logger = match &arguments.log {
-            Some(file) => Some(Logger::start(file, policy, log)?),
+            Some(file) => Some(start_log(file, policy, &log)?),
             None => None,
         };
         let every = arguments.telemetry_every;
@@ -119,6 +170,14 @@ impl Observers {
         });
         let mut failures = Vec::new();
         let log = self.logger.and_then(|logger| note(logger.finish(), &mut failures));
+        // A log of nothing would only take the name from the next run's.
+        let empty = log.as_ref().filter(|log| log.ticks == 0 && log.dropped == 0);
+        if let Some(LogSummary { file, .. }) = empty {
+            let removed = std::fs::remove_file(file)
+                .with_context(|| format!("removing the empty log {}", file.display()));
+            note(removed, &mut failures);
+        }
+        let log = log.filter(|log| log.ticks > 0 || log.dropped > 0);
         self.snapshots.and_then(|snapshots| note(snapshots.finish(), &mut failures));
         let recorded = self.recorder.and_then(|recorder| note(recorder.finish(), &mut failures));
         bar.inspect(indicatif::ProgressBar::finish_and_clear);

@@ -14,8 +14,8 @@ use crate::telemetry::LatencyFiles;
 /// Arguments of `replay`.
 #[derive(Debug, Args)]
 #[command(after_help = "Examples:\n  \
-    rcwm-runtime run --bundle models/bundles/debug --instance demo --log runs/demo.rcwmlog\n  \
-    rcwm-runtime replay --log runs/demo.rcwmlog --bundle models/bundles/debug --json replay.json\n  \
+    rcwm-runtime run --bundle models/bundles/hammer --instance demo --log runs/demo.rcwmlog\n  \
+    rcwm-runtime replay --log runs/demo.rcwmlog --bundle models/bundles/hammer --json replay.json\n  \
     rcwm-runtime replay --log runs/demo.rcwmlog --episodes data\n\n\
     Every call of the policy is made again on the logged inputs, with the logged engine, sampling and seed. Actions, surprise and\n\
     the digest of the state must be the same bit for bit; the first difference is an error. Another engine or another\n\
@@ -28,7 +28,7 @@ pub(super) struct ReplayArguments {
     #[arg(long, value_name = "DIR", required_unless_present = "episodes")]
     bundle: Vec<PathBuf>,
     /// Engine; the log's own unless given
-    #[arg(long, value_enum)]
+    #[arg(long, value_enum, requires = "bundle")]
     engine: Option<EngineKind>,
     /// Writes the logged episodes into this folder as Dreamer's .npz files, one sub-folder a task
     #[arg(long, value_name = "DIR")]
@@ -49,22 +49,29 @@ struct Report {
 }
 
 pub(super) fn run(arguments: &ReplayArguments) -> anyhow::Result<()> {
+    super::prepare_json(arguments.json.as_deref())?;
+    let LatencyFiles { hgrm, plot } = &arguments.latency_files;
+    if arguments.bundle.is_empty() && (hgrm.is_some() || plot.is_some()) {
+        anyhow::bail!("--hgrm and --plot are of a replay: add --bundle, or use `rcwm-runtime telemetry`");
+    }
+    arguments.latency_files.prepare()?;
     let stop = super::stop_flag()?;
     let replay = if arguments.bundle.is_empty() { None } else { Some(replay(arguments, &stop)?) };
     let episodes = match &arguments.episodes {
         Some(folder) if !stop.load(Ordering::Relaxed) => Some(write(arguments, folder, &stop)?),
         _ => None,
     };
-    if let Some(report) = &replay {
-        print!("{}", report.text());
-    }
-    if let Some(written) = &episodes {
-        print!("{}", episode_lines(written));
-    }
     let damage = replay.as_ref().and_then(|report| report.log_damage.clone());
     let damage = damage.or_else(|| episodes.as_ref().and_then(|written| written.log_damage.clone()));
     let difference = replay.as_ref().and_then(|report| report.first_difference.clone());
-    super::write_json(arguments.json.as_ref(), &Report { replay, episodes })?;
+    let report = Report { replay, episodes };
+    super::write_json(arguments.json.as_deref(), &report)?;
+    if let Some(report) = &report.replay {
+        rcwm_models::out!("{}", report.text());
+    }
+    if let Some(written) = &report.episodes {
+        rcwm_models::out!("{}", episode_lines(written));
+    }
     match (difference, damage) {
         (Some(difference), _) => anyhow::bail!("the replay differs first at {difference}"),
         (None, Some(damage)) => anyhow::bail!(damage),
@@ -106,7 +113,7 @@ fn with_bar<T>(
     what: &'static str,
     work: impl FnOnce(&mut dyn FnMut((u64, u64)) -> bool) -> T,
 ) -> T {
-    let bar = super::progress_bar(0, what);
+    let bar = super::progress_bar(0, what, "bytes");
     let mut entries: u64 = 0;
     let result = work(&mut |(read, bytes)| {
         entries += 1;
@@ -122,8 +129,11 @@ fn with_bar<T>(
 }
 
 fn episode_lines(written: &WrittenEpisodes) -> String {
-    let WrittenEpisodes { files, steps, left_out, .. } = written;
+    let WrittenEpisodes { files, steps, left_out, present, .. } = written;
     let mut text = format!("episodes   {} written, {steps} steps", files.len());
+    if *present > 0 {
+        text += &format!("; {present} were there already");
+    }
     if *left_out > 0 {
         text += &format!("; {left_out} left out: observations of them were lost");
     }

@@ -22,8 +22,8 @@ use crate::swap::{SwapSettings, Swapper};
 #[derive(Debug, Args)]
 #[command(after_help = "Examples:\n  \
     rcwm-simulator serve --task reach --instance demo --episodes 3 &\n  \
-    rcwm-runtime run --bundle models/bundles/debug --instance demo --record runs/demo\n  \
-    rcwm-runtime run --bundle models/bundles/debug --instance demo --log demo.rcwmlog --telemetry demo.jsonl\n  \
+    rcwm-runtime run --bundle models/bundles/hammer --instance demo --record runs/demo\n  \
+    rcwm-runtime run --bundle models/bundles/hammer --instance demo --log demo.rcwmlog --telemetry demo.jsonl\n  \
     rcwm-runtime run --bundle DIR --instance arm --realtime --cpu 3 --fallback zero --rate-limit 0.2 \\\n    \
     --surprise-robot-max 20\n\n\
     Ends when the simulator says that it closes, after --episodes, or on Ctrl-C. A simulator that dies is waited for:\n\
@@ -60,7 +60,7 @@ pub(super) struct RunArguments {
     #[arg(long)]
     sample: bool,
     /// Seed of --sample
-    #[arg(long, value_name = "SEED", default_value_t = 0)]
+    #[arg(long, value_name = "SEED", default_value_t = 0, requires = "sample")]
     seed: u64,
     #[command(flatten)]
     observers: ObserverArguments,
@@ -74,6 +74,7 @@ pub(super) struct RunArguments {
 }
 
 pub(super) fn run(arguments: &RunArguments) -> anyhow::Result<()> {
+    arguments.observers.prepare(arguments.json.as_deref())?;
     let stop = super::stop_flag()?;
     let bundle = super::open_bundle(&arguments.bundle)?;
     let engine = EngineSettings::chosen(arguments.engine, arguments.threads, arguments.half_weights)?;
@@ -93,7 +94,7 @@ pub(super) fn run(arguments: &RunArguments) -> anyhow::Result<()> {
     match arguments.swapper(&bundle, engine, sampling) {
         Ok(swapper) => controller.take_swaps(swapper),
         // A run without swaps is better than none.
-        Err(reason) => eprintln!("warning: this run takes no swaps: {reason}"),
+        Err(reason) => rcwm_models::errln!("warning: this run takes no swaps: {reason}"),
     }
     let mut status = StatusLine::start(&arguments.instance).context("starting the status line")?;
     // Asked for last: the other threads stay ordinary ones.
@@ -108,10 +109,11 @@ pub(super) fn run(arguments: &RunArguments) -> anyhow::Result<()> {
     let result = control(&mut controller, &mut status, &mut observers, &stop);
     // The robot has been told: what follows may take its time, or wait for a terminal.
     let closed = controller.close();
-    drop(status);
+    let remarks = status.finish();
     let ended = result.as_ref().map_or_else(Ended::from, |ended| *ended);
     let mut report = controller.report(arguments.engine, ended);
     report.realtime = granted;
+    report.remarks = remarks;
     let telemetry = controller.telemetry().clone();
     drop(controller);
     report.frames_dropped = observers.frames_dropped();
@@ -121,17 +123,17 @@ pub(super) fn run(arguments: &RunArguments) -> anyhow::Result<()> {
     let ran = note(result, &mut failures).is_some();
     failures.extend(unwritten);
     if report.counters.observations > 0 || ran {
-        print!("{}", report.summary());
-        note(super::write_json(arguments.json.as_ref(), &report), &mut failures);
+        note(super::write_json(arguments.json.as_deref(), &report), &mut failures);
+        rcwm_models::out!("{}", report.summary());
     }
-    print!("{}", left.lines());
+    rcwm_models::out!("{}", left.lines());
     let written = note(arguments.observers.write_latencies(&telemetry, &report), &mut failures);
-    print!("{}", written.unwrap_or_default());
+    rcwm_models::out!("{}", written.unwrap_or_default());
     note(closed, &mut failures);
     let mut failures = failures.into_iter();
     let first = failures.next();
     for other in failures {
-        eprintln!("error: {}", super::one_line(other.as_ref()));
+        rcwm_models::errln!("error: {}", super::one_line(other.as_ref()));
     }
     first.map_or(Ok(()), Err)
 }

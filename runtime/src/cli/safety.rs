@@ -63,7 +63,7 @@ pub(super) struct TimeArguments {
     #[arg(long, value_name = "try|require", num_args = 0..=1, require_equals = true, default_missing_value = "try")]
     realtime: Option<Realtime>,
     /// Priority of --realtime
-    #[arg(long, value_name = "1..99", default_value_t = 50, value_parser = clap::value_parser!(u8).range(1..=99))]
+    #[arg(long, value_name = "1..99", default_value_t = 50, requires = "realtime", value_parser = clap::value_parser!(u8).range(1..=99))]
     realtime_priority: u8,
     /// Keeps the loop's thread on this core
     #[arg(long, value_name = "N")]

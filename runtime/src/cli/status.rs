@@ -4,6 +4,9 @@ use std::sync::mpsc::{Receiver, SyncSender, sync_channel};
 use std::thread::JoinHandle;
 use std::time::{Duration, Instant};
 
+use rcwm_models::terminal::LINE_EVERY;
+
+use super::remarks::Remarks;
 use crate::controller::{Tick, TickObserver};
 use crate::telemetry::Stage;
 
@@ -27,6 +30,7 @@ pub(super) struct StatusLine {
     last_observations: u64,
     reported: u64,
     clock_ahead: bool,
+    remarks: Remarks,
 }
 
 impl StatusLine {
@@ -42,7 +46,13 @@ impl StatusLine {
             last_observations: 0,
             reported: 0,
             clock_ahead: false,
+            remarks: Remarks::default(),
         })
+    }
+
+    /// Ends drawing; gives what was remarked.
+    pub(super) fn finish(mut self) -> Vec<String> {
+        self.remarks.take()
     }
 
     fn send(&self, message: Message) {
@@ -81,6 +91,12 @@ impl TickObserver for StatusLine {
             let said = "the robot's clock is ahead of this machine's CLOCK_MONOTONIC: its times are taken as those of receiving";
             self.send(Message::Line(said.into()));
         }
+        let Self { remarks, messages, .. } = self;
+        for remark in remarks.of(tick) {
+            // If the drawing thread is gone or held up there is nothing to draw on.
+            let _ =
+                messages.as_ref().map(|messages| messages.try_send(Message::Line(format!("note: {remark}"))));
+        }
         if self.last.elapsed() >= UPDATE {
             let status = self.status(tick);
             self.send(Message::Status(status));
@@ -108,14 +124,21 @@ impl Drop for StatusLine {
 fn draw(messages: &Receiver<Message>, waiting: String) {
     let bar = indicatif::ProgressBar::new_spinner();
     if bar.is_hidden() {
-        eprintln!("{waiting}");
+        rcwm_models::errln!("{waiting}");
     }
     bar.set_message(waiting);
     bar.enable_steady_tick(UPDATE);
+    let mut last = Instant::now();
     while let Ok(message) = messages.recv() {
         match message {
+            Message::Status(text) if bar.is_hidden() => {
+                if last.elapsed() >= LINE_EVERY {
+                    last = Instant::now();
+                    rcwm_models::errln!("{text}");
+                }
+            }
             Message::Status(text) => bar.set_message(text),
-            Message::Line(text) if bar.is_hidden() => eprintln!("{text}"),
+            Message::Line(text) if bar.is_hidden() => rcwm_models::errln!("{text}"),
             Message::Line(text) => bar.println(text),
         }
     }

@@ -50,6 +50,7 @@ struct Report<'a> {
 }
 
 pub(super) fn run(arguments: &SwapArguments) -> anyhow::Result<()> {
+    super::prepare_json(arguments.json.as_deref())?;
     let stop = super::stop_flag()?;
     let SwapArguments { instance, bundle, now, timeout, json } = arguments;
     let when = if *now { When::Now } else { When::Episode };
@@ -69,10 +70,10 @@ pub(super) fn run(arguments: &SwapArguments) -> anyhow::Result<()> {
     bar.finish_and_clear();
     let total_s = start.elapsed().as_secs_f64();
     let report = Report { instance, bundle, when, answer: &answer, prepared_s: ready_s, total_s };
-    super::write_json(json.as_ref(), &report)?;
+    super::write_json(json.as_deref(), &report)?;
     match answer {
         Answer::Taken { task, preset, updates, .. } => {
-            println!(
+            rcwm_models::outln!(
                 "taken      {preset} bundle for {task} ({updates} updates) runs on instance {instance:?}; ready after {:.2} s, \
                  taken after {total_s:.2} s",
                 ready_s.unwrap_or(total_s)

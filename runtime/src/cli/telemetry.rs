@@ -11,7 +11,7 @@ use crate::telemetry::LatencyFiles;
 /// Arguments of `telemetry`.
 #[derive(Debug, Args)]
 #[command(after_help = "Examples:\n  \
-    rcwm-runtime run --bundle models/bundles/debug --instance demo --log runs/demo.rcwmlog\n  \
+    rcwm-runtime run --bundle models/bundles/hammer --instance demo --log runs/demo.rcwmlog\n  \
     rcwm-runtime telemetry --log runs/demo.rcwmlog --hgrm runs/hgrm --plot runs/latency.png\n\n\
     A run writes the same files with its own --hgrm and --plot, and snapshots while it goes on with --telemetry.")]
 pub(super) struct TelemetryArguments {
@@ -26,24 +26,26 @@ pub(super) struct TelemetryArguments {
 }
 
 pub(super) fn run(arguments: &TelemetryArguments) -> anyhow::Result<()> {
+    super::prepare_json(arguments.json.as_deref())?;
+    arguments.files.prepare()?;
     let stop = super::stop_flag()?;
     let mut log = LogReader::open(&arguments.log)?;
-    let bar = super::progress_bar(0, "reading");
+    let bar = super::progress_bar(0, "reading", "bytes");
     let latencies = LoggedLatencies::read(&mut log, &mut |(read, bytes)| {
         bar.set_length(bytes);
         bar.set_position(read);
         !stop.load(Ordering::Relaxed)
     })?;
     bar.finish_and_clear();
-    print!("{}", latencies.text());
     let header = log.header();
     let title = format!(
         "{} bundle for {}, engine {}: {} logged ticks",
         header.bundle.preset, header.bundle.task, header.engine.kind, latencies.report.ticks
     );
     arguments.files.write(&latencies.telemetry, &title, latencies.report.period_us)?;
-    print!("{}", arguments.files.lines());
-    super::write_json(arguments.json.as_ref(), &latencies.report)?;
+    super::write_json(arguments.json.as_deref(), &latencies.report)?;
+    rcwm_models::out!("{}", latencies.text());
+    rcwm_models::out!("{}", arguments.files.lines());
     match latencies.report.log_damage {
         Some(damage) => anyhow::bail!(damage),
         None => Ok(()),

@@ -11,7 +11,7 @@ use crate::verify::{EngineReport, HalfReport, half_weights, verify, work_units};
 
 /// Arguments of `verify`.
 #[derive(Debug, Args)]
-#[command(after_help = "Example:\n  rcwm-runtime verify --bundle models/bundles/debug --engine all\n\n\
+#[command(after_help = "Example:\n  rcwm-runtime verify --bundle models/bundles/hammer --engine all\n\n\
     Exits 0 if every part and the whole tick agree with the trainer, else 1.")]
 pub(super) struct VerifyArguments {
     /// The bundle's folder
@@ -43,9 +43,10 @@ struct Report<'a> {
 }
 
 pub(super) fn run(arguments: &VerifyArguments) -> anyhow::Result<()> {
+    super::prepare_json(arguments.json.as_deref())?;
     let bundle = super::open_bundle(&arguments.bundle)?;
     let (kinds, left_out) = arguments.engine.engines()?;
-    let bar = super::progress_bar(work_units(&bundle)? * kinds.len(), "verifying");
+    let bar = super::progress_bar(work_units(&bundle)? * kinds.len(), "verifying", "parts and ticks");
     let mut engines = Vec::new();
     for kind in kinds {
         // As a run deploys it.
@@ -53,16 +54,7 @@ pub(super) fn run(arguments: &VerifyArguments) -> anyhow::Result<()> {
         engines.push(verify(&bundle, deployed, arguments.tolerance, &mut || bar.inc(1))?);
     }
     bar.finish_and_clear();
-    for engine in &engines {
-        print!("{}", engine.text());
-    }
-    if let Some(reason) = &left_out {
-        println!("engine ort not checked: {reason}");
-    }
     let half_weights = arguments.half_weights.then(|| half_weights(&bundle)).transpose()?;
-    if let Some(half) = &half_weights {
-        print!("{}", half.text());
-    }
     let failures: Vec<String> = engines
         .iter()
         .flat_map(|engine| engine.failures.iter().map(move |failure| format!("{}: {failure}", engine.engine)))
@@ -75,12 +67,21 @@ pub(super) fn run(arguments: &VerifyArguments) -> anyhow::Result<()> {
         half_weights,
         engines: &engines,
     };
-    super::write_json(arguments.json.as_ref(), &report)?;
+    super::write_json(arguments.json.as_deref(), &report)?;
+    for engine in &engines {
+        rcwm_models::out!("{}", engine.text());
+    }
+    if let Some(reason) = &left_out {
+        rcwm_models::outln!("engine ort not checked: {reason}");
+    }
+    if let Some(half) = &report.half_weights {
+        rcwm_models::out!("{}", half.text());
+    }
     if let Some(first) = failures.first() {
         let more = failures.len() - 1;
         let more = if more > 0 { format!(" (and {more} more)") } else { String::new() };
         anyhow::bail!("{} is NOT verified: {first}{more}", arguments.bundle.display());
     }
-    println!("verified   {}", arguments.bundle.display());
+    rcwm_models::outln!("verified   {}", arguments.bundle.display());
     Ok(())
 }

@@ -187,6 +187,8 @@ pub struct RunReport {
     pub surprise: Option<SurpriseReport>,
     /// What the system granted the loop's thread.
     pub realtime: Option<Granted>,
+    /// What does not fit between robot and policy, for people.
+    pub remarks: Vec<String>,
     /// Frames that were not recorded because the recorder could not keep up.
     pub frames_dropped: u64,
     /// Percentiles per stage.
@@ -222,6 +224,7 @@ impl RunReport {
             counters: *counters,
             surprise: None,
             realtime: None,
+            remarks: Vec::new(),
             frames_dropped: 0,
             latency: Vec::new(),
             earlier_episodes: episodes.ended() - last.len() as u64,
@@ -237,6 +240,9 @@ impl RunReport {
             "run        {} bundle for {}, engine {}, instance {:?}, {pace}\n",
             self.preset, self.bundle_task, self.engine, self.instance
         );
+        for remark in &self.remarks {
+            text += &format!("note       {remark}\n");
+        }
         text += &self.episode_lines();
         text += &self.counter_lines();
         text + &table(&self.latency)

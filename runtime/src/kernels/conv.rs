@@ -1,4 +1,4 @@
-//! Convolution of kernel 4, stride 2 and padding 1 (spec section 1) without a copy of its windows.
+//! Convolution of kernel 4, stride 2 and padding 1, as in the encoder, without a copy of its windows.
 //!
 //! Pixels are rows of channels (channels last). A window is then four runs of `4 * channels` neighbouring numbers, which are read in
 //! place, one at a time, against a panel of output channels that was laid out once; up to 16 sums stay in registers.

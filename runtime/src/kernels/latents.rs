@@ -4,7 +4,7 @@ use pulp::{Arch, Simd, WithSimd};
 
 use super::math::{exp, ln};
 
-/// `x` [rows, classes], logits, becomes `ln(factor * softmax(x) + offset)` in place (spec: the uniform share mixed in).
+/// `x` [rows, classes], logits, becomes `ln(factor * softmax(x) + offset)` in place (`offset` is the share of the uniform distribution that is mixed in).
 ///
 /// # Panics
 /// If `x` is not whole rows: a programming error.

@@ -2,7 +2,8 @@
 
 use std::path::{Path, PathBuf};
 
-use rcwm_models::episode::EpisodeBuilder;
+use rcwm_models::episode::{EPISODE_BYTES_MAX, EpisodeBuilder, EpisodeError};
+use rcwm_models::files::{FileError, free_name, read_capped, write_new};
 use rcwm_models::tasks::task_name;
 use rcwm_models::wire::{Observation, ObservationFlags};
 
@@ -12,8 +13,10 @@ use super::reader::{Entry, LogReader};
 /// What came of a log.
 #[derive(Debug, Clone, PartialEq, Eq, Default, serde::Serialize)]
 pub struct WrittenEpisodes {
-    /// Files written: `FOLDER/TASK/log-00000.npz` and so on.
+    /// Files written: `FOLDER/TASK/INSTANCE-START-00000.npz` and so on, START being when the run began, in seconds since 1970.
     pub files: Vec<PathBuf>,
+    /// Episodes that were there already, from an earlier reading of the log.
+    pub present: u64,
     /// Steps in them.
     pub steps: u64,
     /// Episodes left out: observations of them were lost, or they are a single observation.
@@ -39,6 +42,8 @@ pub fn write_episodes(
     go_on: &mut dyn FnMut((u64, u64)) -> bool,
 ) -> Result<WrittenEpisodes, LogError> {
     let mut written = WrittenEpisodes::default();
+    let name = format!("{}-{}", log.header().instance, log.header().started_unix_s);
+    let finish = |running, written: &mut _| finish(running, &name, folder, written);
     let mut running: Option<Running> = None;
     loop {
         let entry = match log.read() {
@@ -54,19 +59,19 @@ pub fn write_episodes(
             && let Some(observation) = &tick.observation
         {
             if tick.record.is_first {
-                finish(running.take(), folder, &mut written)?;
+                finish(running.take(), &mut written)?;
             }
             let now = running.get_or_insert_with(|| Running::start(observation));
             now.add(observation, tick.record.dropped_before > 0 && !tick.record.is_first);
             if observation.is(ObservationFlags::LAST) {
-                finish(running.take(), folder, &mut written)?;
+                finish(running.take(), &mut written)?;
             }
         }
         if !go_on(log.progress_bytes()) {
             break;
         }
     }
-    finish(running, folder, &mut written)?;
+    finish(running, &mut written)?;
     Ok(written)
 }
 
@@ -86,7 +91,13 @@ impl Running {
     }
 }
 
-fn finish(running: Option<Running>, folder: &Path, written: &mut WrittenEpisodes) -> Result<(), LogError> {
+/// Writes an episode beside those of other logs, never over one; one that is there already is not written again.
+fn finish(
+    running: Option<Running>,
+    name: &str,
+    folder: &Path,
+    written: &mut WrittenEpisodes,
+) -> Result<(), LogError> {
     let Some(mut running) = running else { return Ok(()) };
     let whole = running.builder.finish().filter(|episode| !running.broken && episode.len() > 1);
     let Some(episode) = whole else {
@@ -95,9 +106,23 @@ fn finish(running: Option<Running>, folder: &Path, written: &mut WrittenEpisodes
     };
     let folder = folder.join(running.task);
     std::fs::create_dir_all(&folder).map_err(|source| LogError::Io { path: folder.clone(), source })?;
-    let path = folder.join(format!("log-{:05}.npz", written.files.len()));
-    episode.write(&path)?;
-    written.steps += episode.len() as u64;
-    written.files.push(path);
-    Ok(())
+    let number = written.files.len() as u64 + written.present;
+    let path = folder.join(format!("{name}-{number:05}.npz"));
+    let bytes = episode.to_bytes(&path)?;
+    loop {
+        let is_same = |path: &Path| read_capped(path, EPISODE_BYTES_MAX).is_ok_and(|there| there == bytes);
+        let path = free_name(&path, |path| !path.exists() || is_same(path));
+        match write_new(&path, &bytes) {
+            Ok(()) => written.files.push(path),
+            Err(FileError::Exists { .. }) if is_same(&path) => {
+                written.present += 1;
+                return Ok(());
+            }
+            // Another program was faster; the next name.
+            Err(FileError::Exists { .. }) => continue,
+            Err(error) => return Err(EpisodeError::from(error).into()),
+        }
+        written.steps += episode.len() as u64;
+        return Ok(());
+    }
 }

@@ -2,7 +2,7 @@
 //!
 //! `sequential` runs the exported parts as they are, `compiled` their segments, which work ahead of the image.
 //!
-//! With `z` and `h` carried from the last tick (posterior z, spec section 1):
+//! With `z` and `h` carried from the last tick (z the posterior, eq. 6):
 //!
 //! ```text
 //! features        = encoder(image)

@@ -3,6 +3,8 @@
 //! The loop only copies a tick into a bounded queue after its action was sent; decoding, drawing and writing happen in another
 //! thread. In lock-step a full queue makes the loop wait, in real time the tick is dropped and counted.
 //!
+//! A folder that holds episodes already is gone on with: numbers follow the largest there.
+//!
 //! | file | holds |
 //! | --- | --- |
 //! | `episode-0003.gif` | what the policy saw; with a decoder also what it made of it, branch by branch |
@@ -23,6 +25,7 @@ use std::thread::JoinHandle;
 use rcwm_models::bundle::{Bundle, PartName};
 use rcwm_models::episode::EpisodeError;
 use rcwm_models::files::FileError;
+use rcwm_models::lock::{Lock, LockError};
 use rcwm_models::wire::{Action, Observation};
 
 use crate::controller::{Tick, TickObserver};
@@ -39,6 +42,9 @@ pub enum RecordError {
     /// The folder could not be made, or a file not written.
     #[error("recording: {0}")]
     File(#[from] FileError),
+    /// Another run records there.
+    #[error("recording: {0}")]
+    Lock(#[from] LockError),
     /// The folder could not be made.
     #[error("recording: {path}: {source}")]
     Folder {
@@ -105,6 +111,8 @@ pub struct Recorded {
 pub struct Recorder {
     queue: Option<SyncSender<Box<Frame>>>,
     thread: Option<JoinHandle<Result<Recorded, RecordError>>>,
+    /// Nobody else records there.
+    _lock: Lock,
     dropped: Arc<AtomicU64>,
     episodes_left: u64,
 }
@@ -122,6 +130,7 @@ impl Recorder {
     ) -> Result<Self, RecordError> {
         std::fs::create_dir_all(folder)
             .map_err(|source| RecordError::Folder { path: folder.to_path_buf(), source })?;
+        let lock = Lock::take(folder)?;
         let decoder = match bundle.part(PartName::Decoder) {
             Some(_) => Some(engine::load(bundle, PartName::Decoder, engine)?),
             None => None,
@@ -135,6 +144,7 @@ impl Recorder {
         Ok(Self {
             queue: Some(queue),
             thread: Some(thread),
+            _lock: lock,
             dropped: Arc::default(),
             episodes_left: episodes_max,
         })

@@ -25,6 +25,8 @@ pub(super) struct Worker {
     /// Films play at the rate of the policy unless the simulator says its own.
     rate_hz: f64,
     recorded: Recorded,
+    /// Number of the next episode.
+    number: u64,
     episode: Option<Running>,
 }
 
@@ -41,6 +43,7 @@ impl Worker {
     pub(super) fn new(folder: &Path, decoder: Option<Box<dyn Part>>, rate_hz: f64) -> Self {
         Self {
             folder: folder.to_path_buf(),
+            number: next_number(folder),
             decoder,
             decoded: Decoded::new(),
             rate_hz,
@@ -106,7 +109,8 @@ impl Worker {
     fn finish(&mut self) -> Result<(), RecordError> {
         let Some(mut running) = self.episode.take() else { return Ok(()) };
         // Numbered in the order of recording: a simulator that was started again counts from 0 again.
-        let number = self.recorded.films.len();
+        let number = self.number;
+        self.number += 1;
         let path = |ending: &str| self.folder.join(format!("episode-{number:04}.{ending}"));
         // The data before the pictures: on a full disk it is what must not be lost.
         match running.builder.finish() {
@@ -125,6 +129,13 @@ impl Worker {
         self.recorded.films.push(path("gif"));
         Ok(())
     }
+}
+
+/// Behind all episodes that the folder holds, whatever there is of each.
+fn next_number(folder: &Path) -> u64 {
+    let entries = std::fs::read_dir(folder).into_iter().flatten().flatten();
+    let number = |name: &str| name.strip_prefix("episode-")?.split('.').next()?.parse::<u64>().ok();
+    entries.filter_map(|entry| number(&entry.file_name().to_string_lossy())).max().map_or(0, |last| last + 1)
 }
 
 impl Running {

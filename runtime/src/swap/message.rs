@@ -2,7 +2,8 @@
 //!
 //! The socket has a name but no file (Linux, abstract): nothing is left behind by a run that is killed, and its name is free at once.
 //! A name belongs to whoever takes it first, so that each end looks who the other is: the desk serves its own user and root only, and who
-//! asks talks to a desk of their own user or root's only (root to any). Containers meet where they share the network namespace.
+//! asks talks to a desk of their own user or root's only (root to any). Containers meet where they share the network
+//! namespace and `/dev/shm`.
 
 use std::io::{self, BufRead, BufReader, Read, Write};
 use std::net::Shutdown;
@@ -13,6 +14,7 @@ use std::path::{Path, PathBuf};
 use std::sync::atomic::{AtomicBool, Ordering};
 use std::time::{Duration, Instant};
 
+use rcwm_models::files::sha256_hex;
 use rcwm_models::wire::LinkSettings;
 use serde::{Deserialize, Serialize};
 
@@ -22,6 +24,8 @@ use super::SwapError;
 pub(super) const VERSION: u32 = 1;
 /// Longest line.
 const LINE_BYTES_MAX: u64 = 64 << 10;
+/// Longest name of a socket.
+const NAME_BYTES_MAX: usize = 107;
 /// How often the one who asks looks at its stop flag.
 const LOOK: Duration = Duration::from_millis(100);
 /// How long the one who leaves still hears what the desk says about it.
@@ -87,8 +91,12 @@ impl Answer {
     }
 }
 
+/// The socket's name. Containers may share a network, whose sockets these are, and still have a shared memory each: the number of that
+/// memory keeps runs apart that cannot meet.
 pub(super) fn desk_name(link: &LinkSettings) -> String {
-    format!("rcwm-swap/{}/{}", link.prefix.as_deref().unwrap_or(""), link.instance)
+    let (prefix, memory) = (link.prefix.as_deref().unwrap_or(""), rcwm_models::wire::shared_memory_number());
+    let name = format!("rcwm-swap/{memory}/{prefix}/{}", link.instance);
+    if name.len() <= NAME_BYTES_MAX { name } else { format!("rcwm-swap/{}", sha256_hex(name.as_bytes())) }
 }
 
 pub(super) fn address(name: &str) -> io::Result<SocketAddr> {
@@ -192,4 +200,24 @@ pub(super) fn user_of_peer(stream: &UnixStream) -> io::Result<u32> {
 pub(super) fn is_timeout(error: &io::Error) -> bool {
     use io::ErrorKind::{Interrupted, TimedOut, WouldBlock};
     matches!(error.kind(), Interrupted | TimedOut | WouldBlock)
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn the_longest_names_still_fit_a_socket_and_differ() {
+        let link = |instance: &str| LinkSettings {
+            instance: instance.repeat(64),
+            prefix: Some("p".repeat(32)),
+            ..LinkSettings::new("")
+        };
+        let (a, b) = (desk_name(&link("a")), desk_name(&link("b")));
+        assert_ne!(a, b);
+        address(&a).unwrap();
+        let plain = LinkSettings { prefix: None, ..LinkSettings::new("arm") };
+        let memory = rcwm_models::wire::shared_memory_number();
+        assert_eq!(desk_name(&plain), format!("rcwm-swap/{memory}//arm"), "told apart by shared memory");
+    }
 }

@@ -3,6 +3,7 @@
 use std::path::PathBuf;
 
 use clap::Args;
+use rcwm_models::files::{FileError, Output, prepare_output};
 
 use super::{Curve, PlotError, Stage, Telemetry, plot};
 
@@ -18,6 +19,18 @@ pub struct LatencyFiles {
 }
 
 impl LatencyFiles {
+    /// Makes sure before the work that the files can be written.
+    ///
+    /// # Errors
+    /// [`FileError`] names the place.
+    pub fn prepare(&self) -> Result<(), FileError> {
+        if let Some(folder) = &self.hgrm {
+            std::fs::create_dir_all(folder)
+                .map_err(|source| FileError::Io { path: folder.clone(), source })?;
+        }
+        self.plot.as_deref().map_or(Ok(()), |file| prepare_output(file, Output::Png))
+    }
+
     /// Writes what was asked for; `period_us` is a line in the plot.
     ///
     /// # Errors

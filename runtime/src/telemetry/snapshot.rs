@@ -3,7 +3,7 @@
 //! The loop copies what was recorded since the last tick into a bounded queue; histograms and the file belong to another thread. What
 //! finds the queue full is counted, and each line says how much it was.
 
-use std::fs::{File, OpenOptions};
+use std::fs::{File, OpenOptions, TryLockError};
 use std::io::Write;
 use std::path::PathBuf;
 use std::sync::Arc;
@@ -48,6 +48,12 @@ pub enum SnapshotError {
         /// What the operating system said.
         source: std::io::Error,
     },
+    /// Another run appends to the file.
+    #[error("telemetry {path} is in use: another run appends to it; name another file")]
+    InUse {
+        /// The file.
+        path: PathBuf,
+    },
     /// The thread could not be started, or has panicked.
     #[error("telemetry: {0}")]
     Thread(String),
@@ -81,6 +87,10 @@ impl Snapshots {
     pub fn start(settings: SnapshotSettings) -> Result<Self, SnapshotError> {
         let io = |source| SnapshotError::Io { path: settings.file.clone(), source };
         let file = OpenOptions::new().create(true).append(true).open(&settings.file).map_err(io)?;
+        // Held as long as the file is open. Not every kind of file can be locked.
+        if let Err(TryLockError::WouldBlock) = file.try_lock() {
+            return Err(SnapshotError::InUse { path: settings.file });
+        }
         let (queue, samples) = sync_channel(QUEUE_TICKS);
         let dropped = Arc::new(AtomicU64::new(0));
         let writer = Writer::new(settings, file, Arc::clone(&dropped));

@@ -81,9 +81,9 @@ pub struct ServeArguments {
     /// How time passes.
     #[arg(long, value_enum, default_value_t = PaceName::Lockstep)]
     pub pace: PaceName,
-    /// Observations a second, in real time.
-    #[arg(long, default_value_t = 40.0, value_name = "HZ", value_parser = rate)]
-    pub rate_hz: f64,
+    /// Observations a second, in real time [default: 40].
+    #[arg(long, value_name = "HZ", value_parser = rate)]
+    pub rate_hz: Option<f64>,
     /// Who decides. The scripted ones still wait for an answer to each observation in lock-step, as a receipt.
     #[arg(long, value_enum, default_value_t = Policy::Remote)]
     pub policy: Policy,
@@ -121,6 +121,9 @@ pub struct TasksArguments {
     pub json: Option<PathBuf>,
 }
 
+/// The rate in real time unless told otherwise: that of the policies that we ship.
+const RATE_HZ: f64 = 40.0;
+
 fn rate(text: &str) -> Result<f64, String> {
     match text.parse::<f64>() {
         Ok(rate) if (1.0..=1000.0).contains(&rate) => Ok(rate),
@@ -139,7 +142,21 @@ impl ServeArguments {
             !self.free_run || matches!(self.pace, PaceName::Lockstep),
             "--free-run has no clock: leave out --pace realtime"
         );
+        anyhow::ensure!(
+            self.rate_hz.is_none() || matches!(self.pace, PaceName::Realtime),
+            "--rate-hz is of a clock, and lock-step has none: add --pace realtime"
+        );
+        anyhow::ensure!(
+            !self.free_run || self.wait_controller == 0,
+            "--free-run waits for no controller: leave out --wait-controller"
+        );
         Ok(())
+    }
+
+    /// Time between two observations, in real time.
+    pub fn period_ns(&self) -> Option<u64> {
+        let period_ns = (1e9 / self.rate_hz.unwrap_or(RATE_HZ)).round() as u64;
+        matches!(self.pace, PaceName::Realtime).then_some(period_ns)
     }
 
     /// What to simulate.
@@ -156,10 +173,10 @@ impl ServeArguments {
 
     /// How to serve it.
     pub fn serve(&self) -> ServeSettings {
-        let pace = match self.pace {
-            PaceName::Realtime => Pace::RealTime { period_ns: (1e9 / self.rate_hz).round() as u64 },
-            PaceName::Lockstep if self.free_run => Pace::Free,
-            PaceName::Lockstep => Pace::LockStep,
+        let pace = match self.period_ns() {
+            Some(period_ns) => Pace::RealTime { period_ns },
+            None if self.free_run => Pace::Free,
+            None => Pace::LockStep,
         };
         ServeSettings {
             instance: self.instance.clone(),
@@ -171,5 +188,50 @@ impl ServeArguments {
             silence_max: (self.wait_controller > 0).then(|| Duration::from_secs(self.wait_controller)),
             snapshots: self.snapshot.clone(),
         }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use clap::CommandFactory;
+    use rcwm_models::help::{examples, missing_file};
+
+    use super::*;
+
+    /// The help texts of the program and of all its verbs.
+    fn help_texts() -> Vec<String> {
+        let command = Cli::command();
+        let all = std::iter::once(command.clone()).chain(command.get_subcommands().cloned());
+        all.map(|mut command| command.render_long_help().ansi().to_string()).collect()
+    }
+
+    #[test]
+    fn every_example_is_understood_and_names_files_that_are_shipped() {
+        let root = std::path::Path::new(env!("CARGO_MANIFEST_DIR")).join("../..");
+        let found: Vec<_> = help_texts().iter().flat_map(|text| examples(text, "rcwm-simulator")).collect();
+        assert!(found.len() > 4, "{found:?}");
+        for example in found {
+            let parsed = Cli::try_parse_from(&example);
+            assert!(
+                parsed.is_ok(),
+                "{example:?}: {}",
+                parsed.err().map_or_else(String::new, |e| e.to_string())
+            );
+            assert_eq!(missing_file(&example, &root), None, "{example:?}");
+        }
+    }
+
+    #[test]
+    fn options_that_would_be_ignored_are_refused() {
+        let check = |line: &str| {
+            let words = std::iter::once("program").chain(line.split_whitespace());
+            let Ok(Cli { command: Command::Serve(arguments) }) = Cli::try_parse_from(words) else {
+                panic!("{line}")
+            };
+            arguments.check()
+        };
+        assert!(check("serve --task reach --rate-hz 20").is_err());
+        assert!(check("serve --task reach --policy expert --free-run --wait-controller 3").is_err());
+        check("serve --task reach --pace realtime --rate-hz 20").unwrap();
     }
 }

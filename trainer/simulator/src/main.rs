@@ -2,7 +2,6 @@
 
 mod cli;
 
-use std::io::Write;
 use std::path::Path;
 use std::process::ExitCode;
 use std::sync::Arc;
@@ -13,8 +12,9 @@ use anyhow::{Context, Result};
 use clap::Parser;
 use indicatif::{ProgressBar, ProgressStyle};
 use rcwm_models::errors::one_line;
-use rcwm_models::files::write_atomic;
+use rcwm_models::files::{Output, prepare_output, write_output};
 use rcwm_models::tasks::{DOWNSTREAM, TASKS, UPSTREAM, task_id};
+use rcwm_models::terminal::Heartbeat;
 use rcwm_models::wire::{LinkSettings, SimulatorLink};
 use rcwm_simulator::environment::Environment;
 use rcwm_simulator::serve::{ServeSettings, serve};
@@ -27,10 +27,12 @@ fn main() -> ExitCode {
         Command::Serve(arguments) => run_serve(&arguments),
         Command::Tasks(arguments) => run_tasks(&arguments),
     };
-    match outcome {
+    // What standard output has lost is an error, too, but not the first to be told.
+    let told = || rcwm_models::terminal::finish().context("standard output");
+    match outcome.and_then(|()| told()) {
         Ok(()) => ExitCode::SUCCESS,
         Err(error) => {
-            eprintln!("rcwm-simulator: {}", one_line(error.as_ref()));
+            rcwm_models::errln!("rcwm-simulator: {}", one_line(error.as_ref()));
             ExitCode::FAILURE
         }
     }
@@ -39,6 +41,7 @@ fn main() -> ExitCode {
 fn run_serve(arguments: &ServeArguments) -> Result<()> {
     task_id(&arguments.task)?;
     arguments.check()?;
+    prepare_json(arguments.json.as_deref())?;
     let stop = stop_flag()?;
     if let Some(folder) = &arguments.snapshot {
         std::fs::create_dir_all(folder).with_context(|| format!("creating {}", folder.display()))?;
@@ -50,10 +53,15 @@ fn run_serve(arguments: &ServeArguments) -> Result<()> {
     let spinner = loading(&arguments.task);
     let environment = Environment::open(arguments.environment())?;
     spinner.finish_and_clear();
-    eprintln!("serving {} on instance {:?}; Ctrl-C ends", arguments.task, arguments.instance);
+    rcwm_models::errln!("serving {} on instance {:?}; Ctrl-C ends", arguments.task, arguments.instance);
 
     let settings = arguments.serve();
     let bar = episodes_bar(&settings);
+    let _lines = bar.is_hidden().then(|| {
+        let bar = bar.clone();
+        let length = |bar: &ProgressBar| bar.length().filter(|all| *all > 0);
+        Heartbeat::of_work("serving", "steps", move || (bar.position(), length(&bar), bar.message()))
+    });
     let tally = serve(&environment, link, &settings, &stop, |episode, step| {
         bar.set_position(
             (episode - settings.first_episode) * u64::from(settings.steps_max) + u64::from(step),
@@ -64,8 +72,12 @@ fn run_serve(arguments: &ServeArguments) -> Result<()> {
     })?;
     bar.finish_and_clear();
     let report = tally.report(&arguments.task, &arguments.instance, arguments.seed, arguments.first_episode);
-    print_line(&report.to_string())?;
-    arguments.json.as_deref().map_or(Ok(()), |file| write_json(file, &report))
+    arguments.json.as_deref().map_or(Ok(()), |file| write_json(file, &report))?;
+    rcwm_models::outln!("{report}");
+    if let Some(remark) = arguments.period_ns().and_then(|period_ns| report.remark(period_ns)) {
+        rcwm_models::errln!("note: {remark}");
+    }
+    Ok(())
 }
 
 /// Set by the first Ctrl-C, SIGTERM or SIGHUP; the second one ends the process at once.
@@ -111,10 +123,11 @@ fn run_tasks(arguments: &TasksArguments) -> Result<()> {
     let entries: Vec<TaskEntry> =
         TASKS.iter().enumerate().map(|(id, name)| TaskEntry { id, name, role: role(name) }).collect();
     if let Some(file) = &arguments.json {
+        prepare_json(Some(file))?;
         return write_json(file, &entries);
     }
     for TaskEntry { id, name, role } in &entries {
-        print_line(format!("{id:2}  {name:26}{}", role.unwrap_or_default()).trim_end())?;
+        rcwm_models::outln!("{}", format!("{id:2}  {name:26}{}", role.unwrap_or_default()).trim_end());
     }
     Ok(())
 }
@@ -127,16 +140,14 @@ fn role(task: &str) -> Option<&'static str> {
     }
 }
 
-/// Standard output may be a closed pipe (`| head`): an error, not a panic.
-fn print_line(text: &str) -> Result<()> {
-    writeln!(std::io::stdout(), "{text}").context("writing to standard output")
+/// Makes sure before the work that its result can be written.
+fn prepare_json(file: Option<&Path>) -> Result<()> {
+    let Some(file) = file else { return Ok(()) };
+    prepare_output(file, Output::Json).context("--json")
 }
 
 /// Writes JSON to a file; `-` is standard output.
 fn write_json(file: &Path, value: &impl Serialize) -> Result<()> {
     let text = serde_json::to_string_pretty(value)?;
-    if file == Path::new("-") {
-        return print_line(&text);
-    }
-    Ok(write_atomic(file, format!("{text}\n").as_bytes())?)
+    write_output(file, format!("{text}\n").as_bytes()).context("--json")
 }

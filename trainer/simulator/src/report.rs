@@ -158,6 +158,26 @@ impl Tally {
     }
 }
 
+impl Report {
+    /// What is to be said of a clock that was not kept.
+    #[must_use]
+    pub fn remark(&self, period_ns: u64) -> Option<String> {
+        // One tick in twenty: less is a hiccup.
+        let slow = self.ticks_missed * 20 > self.observations + self.ticks_missed;
+        let ms = |ns: f64| ns / 1e6;
+        slow.then(|| {
+            format!(
+                "this machine cannot keep {:.1} Hz: {} ticks were skipped; a step takes {:.1} ms (p50) of the {:.1} ms there are; \
+                 lower --rate-hz",
+                1e9 / period_ns as f64,
+                self.ticks_missed,
+                ms(1e3 * self.work.p50_us as f64),
+                ms(period_ns as f64)
+            )
+        })
+    }
+}
+
 impl fmt::Display for Report {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
         writeln!(f, "{} (seed {}, instance {:?})", self.task, self.seed, self.instance)?;
@@ -200,6 +220,15 @@ mod tests {
         assert!(report.success_rate.is_none() && report.return_mean.is_none());
         assert!(serde_json::to_string(&report).unwrap().contains("\"success_rate\":null"));
         assert!(report.to_string().contains("episodes     0\n"));
+    }
+
+    #[test]
+    fn a_clock_that_is_not_kept_is_remarked_with_the_remedy() {
+        let report =
+            |missed| Tally { observations: 100, missed, ..Tally::default() }.report("reach", "a", 0, 0);
+        assert!(report(3).remark(2_000_000).is_none());
+        let remark = report(50).remark(2_000_000).unwrap();
+        assert!(remark.contains("cannot keep 500.0 Hz") && remark.contains("--rate-hz"), "{remark}");
     }
 
     #[test]

@@ -1,4 +1,4 @@
-//! Actor-critic learning in imagination (spec: behaviour; eq. 10-12).
+//! Actor-critic learning in imagination (eq. 10-12).
 //!
 //! | file | holds |
 //! | --- | --- |

@@ -3,7 +3,7 @@ use serde::{Deserialize, Serialize};
 
 use super::BehaviourSettings;
 
-/// Average range of the returns, by which they are scaled (spec: behaviour). Starts at 0.
+/// Average range of the returns, by which they are scaled (as in DreamerV3). Starts at 0.
 #[derive(Debug, Clone, Copy, PartialEq, Default, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct ReturnRange {

@@ -3,7 +3,7 @@ use serde::{Deserialize, Serialize};
 use super::Horizon;
 use crate::learning::AdamSettings;
 
-/// How actor and critic learn (spec: behaviour; paper, Table 2).
+/// How actor and critic learn (paper, Table 2).
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields, default)]
 pub struct BehaviourSettings {

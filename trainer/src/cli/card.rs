@@ -54,7 +54,7 @@ impl Card {
         let path = self.bundle.join("README.md");
         let card = self.card(&bundle, &settings, &learnt, pretrained.as_ref(), &results)?;
         write_atomic(&path, card.as_bytes())?;
-        println!("card in {}", path.display());
+        rcwm_models::outln!("card in {}", path.display());
         Ok(ExitCode::SUCCESS)
     }
 

@@ -2,13 +2,15 @@ use std::path::PathBuf;
 use std::process::ExitCode;
 use std::time::{Duration, Instant};
 
-use anyhow::{Context, Result, ensure};
+use anyhow::{Context, Result, bail, ensure};
 use indicatif::{ProgressBar, ProgressStyle};
 use rcwm_models::tasks::{DOWNSTREAM, UPSTREAM, task_id};
 use rcwm_trainer::simulators::{
     Amounts, CollectSettings, Collected, DISTURBANCES, Plan, Seen, Sums, collect, collect_disturbed, record,
 };
 use serde::Serialize;
+
+use super::bars::Bar;
 
 /// Record episodes of Meta-World, as Dreamer's .npz files in one folder a task
 #[derive(Debug, clap::Args)]
@@ -47,13 +49,14 @@ pub struct Collect {
     #[arg(long, default_value_t = 0)]
     seed: u64,
     /// Simulators at a time [default: one a core]
-    #[arg(long, value_name = "N")]
+    #[arg(long, value_name = "N", conflicts_with = "join")]
     simulators: Option<usize>,
     /// Decisions in an episode
-    #[arg(long, default_value_t = 250, value_name = "N", value_parser = clap::value_parser!(u32).range(1..=250))]
+    #[arg(long, default_value_t = 250, value_name = "N", conflicts_with = "join",
+        value_parser = clap::value_parser!(u32).range(1..=250))]
     steps_max: u32,
     /// Visual disturbance
-    #[arg(long, default_value = "none", value_parser = DISTURBANCES)]
+    #[arg(long, default_value = "none", conflicts_with = "join", value_parser = DISTURBANCES)]
     disturb: String,
     /// Add to every episode what it looks like with this disturbance: the script does the same once more. What is learned
     /// from can be seen so (replay.look), and drawn as it is
@@ -72,6 +75,15 @@ pub struct Collect {
 
 impl Collect {
     pub fn run(self) -> Result<ExitCode> {
+        super::prepare_json(self.json.as_deref())?;
+        if let Some(run) = self.out.ancestors().take(3).find(|folder| folder.join("settings.toml").is_file())
+        {
+            bail!(
+                "--out {}: {} holds a run, whose folder is its own; choose another",
+                self.out.display(),
+                run.display()
+            );
+        }
         let stop = super::stop_on_ctrl_c()?;
         let started = Instant::now();
         let (sums, present) = match &self.join {
@@ -79,11 +91,11 @@ impl Collect {
             None => self.collect(&stop)?,
         };
         let report = Report::new(sums, present, started.elapsed());
+        self.json.as_deref().map_or(Ok(()), |file| super::write_json(file, &report))?;
         report.print();
         if stop.load(std::sync::atomic::Ordering::Relaxed) {
-            println!("stopped; the same command goes on");
+            rcwm_models::outln!("stopped; the same command goes on");
         }
-        self.json.as_deref().map_or(Ok(()), |file| super::write_json(file, &report))?;
         Ok(ExitCode::SUCCESS)
     }
 
@@ -152,12 +164,12 @@ impl Collect {
 /// Episodes of one simulator in a row: loading Meta-World takes about as long as two of them.
 const EPISODES_A_RUN: u64 = 30;
 
-pub(super) fn bar(episodes: u64, steps_max: u32) -> Result<ProgressBar> {
+pub(super) fn bar(episodes: u64, steps_max: u32) -> Result<Bar> {
     let steps = episodes.saturating_mul(u64::from(steps_max) + 1);
     let template = "{wide_bar} {pos}/{len} steps, {per_sec}, ETA {eta}, {msg} episodes";
     let bar = ProgressBar::new(steps).with_style(ProgressStyle::with_template(template)?).with_message("0");
     bar.enable_steady_tick(Duration::from_millis(200));
-    Ok(bar)
+    Ok(Bar::new(bar, "recording", "steps"))
 }
 
 pub(super) fn advance(bar: &ProgressBar, seen: Seen) {
@@ -205,18 +217,27 @@ impl Report {
     }
 
     fn print(&self) {
-        println!(
+        rcwm_models::outln!(
             "{:24} {:>8} {:>9} {:>8} {:>8} {:>12}",
-            "task", "policy", "episodes", "steps", "solved", "mean return"
+            "task",
+            "policy",
+            "episodes",
+            "steps",
+            "solved",
+            "mean return"
         );
         for Row { task, policy, collected } in &self.rows {
             let Collected { episodes, steps, successes, reward_sum, .. } = collected;
             let mean = reward_sum / (*episodes).max(1) as f64;
-            println!("{task:24} {policy:>8} {episodes:>9} {steps:>8} {successes:>8} {mean:>12.1}");
+            rcwm_models::outln!("{task:24} {policy:>8} {episodes:>9} {steps:>8} {successes:>8} {mean:>12.1}");
         }
-        println!(
+        rcwm_models::outln!(
             "{} episodes, {} steps in {:.0} s: {:.0} a second; {} episodes were there already",
-            self.episodes, self.steps, self.seconds, self.steps_per_s, self.episodes_present
+            self.episodes,
+            self.steps,
+            self.seconds,
+            self.steps_per_s,
+            self.episodes_present
         );
     }
 }

@@ -23,6 +23,7 @@ use rcwm_trainer::replay::Folder;
 use rcwm_trainer::report::shown_path;
 use rcwm_trainer::simulators::{DISTURBANCES, LAYOUTS};
 
+use super::bars::{self, Bar};
 use super::report::{Inputs, ReportArguments};
 
 /// Judge models: robot dynamics on recorded episodes, or success in the simulator
@@ -48,6 +49,8 @@ their training seed only are taken together: then intervals are over seeds. With
 rcwm-simulator, in lock-step; a vanilla model, which no runtime deploys, decides in this process.
 With --report: both, as one page that shows all that lies in the folder's parts; a part is measured
 again only if it is asked for from something else. Ctrl-C keeps what is done.")]
+#[command(group = clap::ArgGroup::new("recorded").multiple(true).args(["data", "report"]))]
+#[command(group = clap::ArgGroup::new("deployed").multiple(true).args(["tasks", "report"]))]
 #[command(group = clap::ArgGroup::new("on").required(true).multiple(true).args(["data", "tasks", "report"]))]
 pub struct Evaluate {
     /// Folder of a checkpoint (repeatable with --data: the later ones are compared with the first)
@@ -60,25 +63,25 @@ pub struct Evaluate {
     #[arg(long, value_name = "DIR", requires = "data")]
     masks: Option<PathBuf>,
     /// Trajectories a task
-    #[arg(long, default_value_t = 100, value_name = "N")]
+    #[arg(long, default_value_t = 100, value_name = "N", requires = "recorded")]
     trajectories: usize,
     /// Steps that are seen
-    #[arg(long, default_value_t = 10, value_name = "N")]
+    #[arg(long, default_value_t = 10, value_name = "N", requires = "recorded")]
     context: usize,
     /// Steps that are imagined after them
-    #[arg(long, default_value_t = 54, value_name = "N")]
+    #[arg(long, default_value_t = 54, value_name = "N", requires = "recorded")]
     imagined: usize,
     /// Which windows of the episodes: those that end before the task is solved and in which the robot moves, or all
-    #[arg(long, value_enum, default_value = "moving")]
+    #[arg(long, value_enum, default_value = "moving", requires = "recorded")]
     windows: WindowsName,
     /// What the recorded actions are compared with, from the same start
-    #[arg(long, value_enum, default_value = "still")]
+    #[arg(long, value_enum, default_value = "still", requires = "recorded")]
     other_actions: OtherActionsName,
     /// Take the most probable latents and actions, or draw them [default: sample with --data, mode with --task]
     #[arg(long, value_enum)]
     latents: Option<LatentsName>,
     /// Films a task and model, written to --out, or strips in a report [default: 2, in a report 1]
-    #[arg(long, value_name = "N")]
+    #[arg(long, value_name = "N", requires = "recorded")]
     films: Option<usize>,
     /// Folder for plots and films
     #[arg(long, value_name = "DIR", requires = "data")]
@@ -90,34 +93,34 @@ pub struct Evaluate {
     #[arg(long, value_name = "DIR", conflicts_with_all = ["checkpoints", "data"])]
     bundle: Option<PathBuf>,
     /// Episodes of each task
-    #[arg(long, default_value_t = 20, value_name = "N", value_parser = clap::value_parser!(u64).range(1..))]
+    #[arg(long, default_value_t = 20, value_name = "N", requires = "deployed", value_parser = clap::value_parser!(u64).range(1..))]
     episodes: u64,
     /// Decisions in an episode
-    #[arg(long, default_value_t = 250, value_name = "N", value_parser = clap::value_parser!(u32).range(1..=250))]
+    #[arg(long, default_value_t = 250, value_name = "N", requires = "deployed", value_parser = clap::value_parser!(u32).range(1..=250))]
     steps_max: u32,
     /// Visual disturbance (repeatable; a report always has none too)
-    #[arg(long, default_value = "none", value_parser = DISTURBANCES)]
+    #[arg(long, default_value = "none", requires = "deployed", value_parser = DISTURBANCES)]
     disturb: Vec<String>,
     /// The runtime's engine, or the trainer itself in a runtime's place
-    #[arg(long, default_value = "tract", value_parser = ["tract", "ort", TRAINER_ENGINE])]
+    #[arg(long, default_value = "tract", requires = "deployed", value_parser = ["tract", "ort", TRAINER_ENGINE])]
     engine: String,
     /// Simulators at a time, each with a runtime
-    #[arg(long, default_value_t = 1, value_name = "N", value_parser = clap::value_parser!(u64).range(1..=256))]
+    #[arg(long, default_value_t = 1, value_name = "N", requires = "deployed", value_parser = clap::value_parser!(u64).range(1..=256))]
     simulators: u64,
     /// Path of rcwm-simulator, where it is not beside this program
-    #[arg(long, value_name = "FILE")]
+    #[arg(long, value_name = "FILE", requires = "deployed")]
     simulator: Option<PathBuf>,
     /// Path of rcwm-runtime, where it is not beside this program
-    #[arg(long, value_name = "FILE")]
+    #[arg(long, value_name = "FILE", requires = "deployed")]
     runtime: Option<PathBuf>,
     /// Trajectories, draws and layouts depend on this
     #[arg(long, default_value_t = 0)]
     seed: u64,
     /// Which layouts to score on. No two sets share one; settings are chosen on `choosing`, what is told is from `reporting`
-    #[arg(long, default_value = "reporting", value_parser = LAYOUTS)]
+    #[arg(long, default_value = "reporting", requires = "deployed", value_parser = LAYOUTS)]
     layouts: String,
     /// Where to compute with --data: cpu, cuda or cuda:N
-    #[arg(long, default_value = "cpu")]
+    #[arg(long, default_value = "cpu", requires = "recorded")]
     device: String,
     /// Write what was measured as JSON
     #[arg(long, value_name = "FILE")]
@@ -152,6 +155,7 @@ enum OtherActionsName {
 
 impl Evaluate {
     pub fn run(self) -> Result<ExitCode> {
+        super::prepare_json(self.json.as_deref())?;
         let stop = super::stop_on_ctrl_c()?;
         match (&self.report.report, &self.data) {
             (Some(folder), _) => self.report(folder, &stop)?,
@@ -216,14 +220,15 @@ impl Evaluate {
         let models = self.models(&device)?;
         let tasks = self.trajectories(data, &settings)?;
         let report = self.measure(&models, &tasks, &settings, &device, stop)?;
-        print!("{}", report.table());
+        self.json.as_deref().map_or(Ok(()), |file| super::write_json(file, &report))?;
+        rcwm_models::out!("{}", report.table());
         if let Some(out) = &self.out {
             for measure in Measure::ALL {
                 plots::write_png(&report.plot(measure)?, &out.join(format!("{}.png", measure.name())))?;
             }
-            println!("plots and films in {}", out.display());
+            rcwm_models::outln!("plots and films in {}", out.display());
         }
-        self.json.as_deref().map_or(Ok(()), |file| super::write_json(file, &report))
+        Ok(())
     }
 
     /// The checkpoints by name: what kind of model they are, or where they lie if there are several of a kind.
@@ -245,13 +250,15 @@ impl Evaluate {
 
     fn trajectories(&self, data: &Path, settings: &OpenLoopSettings) -> Result<Vec<TaskTrajectories>> {
         let folder = Folder::list(data, self.masks.as_deref())?;
+        bars::tell(&folder.notes());
         let bar = ProgressBar::new(folder.len() as u64)
             .with_style(ProgressStyle::with_template("loading {wide_bar} {pos}/{len} episodes")?);
+        let bar = Bar::new(bar, "loading", "episodes");
         let recordings = Recordings::load(&folder, || bar.inc(1))?;
         bar.finish_and_clear();
         let tasks = TaskTrajectories::choose(&recordings, settings)?;
         for task in &tasks {
-            println!("{}", task.summary(settings.context));
+            rcwm_models::outln!("{}", task.summary(settings.context));
         }
         Ok(tasks)
     }
@@ -267,6 +274,7 @@ impl Evaluate {
         let total: usize = tasks.iter().map(|task| task.chosen.len() * models.len()).sum();
         let template = "{wide_bar} {pos}/{len} trajectories, ETA {eta}, {msg}";
         let bar = ProgressBar::new(total as u64).with_style(ProgressStyle::with_template(template)?);
+        let bar = Bar::new(bar, "imagining", "trajectories");
         let mut report = OpenLoopReport::new(*settings);
         let mut first: Vec<Measured> = Vec::new();
         for (name, path, checkpoint) in models {
@@ -375,7 +383,7 @@ impl Evaluate {
             };
             bar.finish_and_clear();
             let report = report?;
-            println!("{}", describe(&report));
+            rcwm_models::outln!("{}", describe(&report));
             reports.push(report);
         }
         let of = self.bundle.as_ref().or(self.checkpoints.first()).cloned();
@@ -404,7 +412,9 @@ impl Evaluate {
         let checkpoint = Checkpoint::read(checkpoint, &Device::Cpu)?;
         let vanilla = checkpoint.settings.model.kind == ModelKind::Vanilla;
         if vanilla && self.engine != TRAINER_ENGINE {
-            eprintln!("evaluate: no runtime deploys a vanilla model; --engine trainer takes its place");
+            rcwm_models::errln!(
+                "evaluate: no runtime deploys a vanilla model; --engine trainer takes its place"
+            );
         }
         if vanilla || self.engine == TRAINER_ENGINE {
             return Ok(Deployed::Here(Box::new(checkpoint)));
@@ -445,13 +455,13 @@ impl export::Progress for Stop<'_> {
     }
 }
 
-fn episodes_bar(episodes: u64, steps_max: u32, task: &str) -> Result<ProgressBar> {
+fn episodes_bar(episodes: u64, steps_max: u32, task: &str) -> Result<Bar> {
     let template = "{msg} {wide_bar} {pos}/{len} steps, {per_sec}, ETA {eta}";
     let bar = ProgressBar::new(episodes * u64::from(steps_max))
         .with_style(ProgressStyle::with_template(template)?)
         .with_message(task.to_owned());
     bar.enable_steady_tick(Duration::from_millis(200));
-    Ok(bar)
+    Ok(Bar::new(bar, "deciding", "steps"))
 }
 
 fn describe(report: &ClosedLoopReport) -> String {

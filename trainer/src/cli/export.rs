@@ -1,10 +1,9 @@
-use std::io::IsTerminal;
 use std::path::{Path, PathBuf};
 use std::process::ExitCode;
 use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, Ordering};
 
-use anyhow::{Context, Result};
+use anyhow::{Context, Result, bail};
 use candle_core::Device;
 use clap::ValueEnum;
 use indicatif::{ProgressBar, ProgressStyle};
@@ -14,14 +13,17 @@ use rcwm_trainer::checkpoint::{Checkpoint, CheckpointError, SETTINGS_FILE};
 use rcwm_trainer::export::{self, ExportError, Options, Progress};
 use serde::Serialize;
 
+use super::bars;
+
 /// Export a checkpoint as a bundle that a runtime deploys
 #[derive(Debug, clap::Args)]
 #[command(after_help = "Examples:
   rcwm-trainer export --checkpoint runs/untrained --out bundles/untrained
   rcwm-trainer export --checkpoint runs/hammer --out bundles/hammer --task hammer --force
+                      (a run's folder stands for its newest checkpoint)
   rcwm-trainer export --checkpoint runs/small/checkpoints/last --form checkpoint --half --out models/small")]
 pub struct Export {
-    /// Folder of the checkpoint
+    /// Folder of the checkpoint, or of a run: its newest one
     #[arg(long, value_name = "DIR")]
     checkpoint: PathBuf,
     /// Folder of the bundle
@@ -91,6 +93,17 @@ struct PartSize<'a> {
 
 impl Export {
     pub fn run(self) -> Result<ExitCode> {
+        super::prepare_json(self.json.as_deref())?;
+        if self.form == Form::Checkpoint {
+            let of_bundles = [
+                ("--golden-episode", self.golden_episode.is_some()),
+                ("--json", self.json.is_some()),
+                ("--parts", matches!(self.parts, Parts::Required)),
+            ];
+            if let Some((option, _)) = of_bundles.into_iter().find(|(_, given)| *given) {
+                bail!("{option} is of a bundle; --form checkpoint writes weights and settings only");
+            }
+        }
         if self.task != tasks::task_name(tasks::OWN_TASK) {
             tasks::task_id(&self.task).with_context(|| "--task")?;
         }
@@ -130,7 +143,11 @@ impl Export {
             return Err(CheckpointError::Exists { path: self.out.clone() }.into());
         }
         checkpoint.write(&self.out)?;
-        println!("checkpoint of {} updates in {}", checkpoint.settings.updates, self.out.display());
+        rcwm_models::outln!(
+            "checkpoint of {} updates in {}",
+            checkpoint.settings.updates,
+            self.out.display()
+        );
         Ok(ExitCode::SUCCESS)
     }
 
@@ -144,32 +161,32 @@ impl Export {
             golden_bytes: manifest.golden.bytes,
             parts: parts.collect(),
         };
-        for part in &outcome.parts {
-            println!("{:<12} {:>8.2} MB", part.name, part.bytes as f64 / 1e6);
+        if let Some(path) = &self.json {
+            super::write_json(path, &outcome)?;
         }
-        println!(
+        for part in &outcome.parts {
+            rcwm_models::outln!("{:<12} {:>8.2} MB", part.name, part.bytes as f64 / 1e6);
+        }
+        rcwm_models::outln!(
             "{:<12} {:>8.2} MB, {}",
             "golden",
             outcome.golden_bytes as f64 / 1e6,
             manifest.provenance.data
         );
-        println!("bundle in {}", self.out.display());
-        match &self.json {
-            Some(path) => super::write_json(path, &outcome),
-            None => Ok(()),
-        }
+        rcwm_models::outln!("bundle in {}", self.out.display());
+        Ok(())
     }
 }
 
 /// A progress bar that Ctrl-C stops.
 struct Bar {
-    bar: ProgressBar,
+    bar: bars::Bar,
     interrupted: Arc<AtomicBool>,
 }
 
 impl Bar {
     fn new() -> Result<Self> {
-        let bar = if std::io::stderr().is_terminal() { ProgressBar::new(0) } else { ProgressBar::hidden() };
+        let bar = bars::Bar::new(ProgressBar::new(0), "exporting", "steps");
         bar.set_style(ProgressStyle::with_template("{msg:<32} {bar:30} {pos}/{len}")?);
         let interrupted = Arc::new(AtomicBool::new(false));
         let flag = interrupted.clone();

@@ -3,10 +3,10 @@ use std::process::ExitCode;
 
 use anyhow::Result;
 use indicatif::{ProgressBar, ProgressStyle};
-use rcwm_models::settings::{self, SettingsError};
+use rcwm_models::settings::SettingsError;
 use rcwm_models::tasks::task_id;
 use rcwm_trainer::checkpoint::Checkpoint;
-use rcwm_trainer::replay::Replay;
+use rcwm_trainer::replay::{Folder, Replay};
 use rcwm_trainer::training::{
     Fewshot as Learning, Line, Phase, Reset, Run, TrainingError, TrainingSettings, demonstrations,
 };
@@ -31,13 +31,13 @@ folder. A resumed run gives the same weights, bit for bit, as one that was never
 the same RAYON_NUM_THREADS.")]
 pub struct Fewshot {
     /// Checkpoint of the pre-trained model
-    #[arg(long, value_name = "CHECKPOINT", required_unless_present = "resume")]
+    #[arg(long, value_name = "CHECKPOINT", required_unless_present = "resume", conflicts_with = "resume")]
     from: Option<PathBuf>,
-    /// Folder of episodes, one sub-folder a task
+    /// Folder of episodes, one sub-folder a task; with --resume, where it lies now
     #[arg(long, value_name = "DIR", required_unless_present = "resume")]
     data: Option<PathBuf>,
     /// The task whose demonstrations are used [default: all that --data has]
-    #[arg(long)]
+    #[arg(long, conflicts_with = "resume")]
     task: Option<String>,
     /// Folder of the run
     #[arg(long, value_name = "DIR")]
@@ -81,6 +81,7 @@ impl Fewshot {
             None => Learning::resume(&self.out, settings.clone(), &device)?,
         };
         let bar = bars::updates(settings.fewshot.updates(), learning.updates());
+        let bar = bars::Bar::new(bar, "", "updates");
         let outcome = learning.run(replay, &stop, |updates, line| {
             bar.set_position(updates);
             if let Some(line) = line {
@@ -90,12 +91,16 @@ impl Fewshot {
         bar.finish_and_clear();
         let out = self.out.display();
         if outcome.interrupted {
-            println!(
+            rcwm_models::outln!(
                 "stopped and saved after {} updates; go on with fewshot --resume --out {out}",
                 outcome.updates
             );
         } else {
-            println!("{} updates; checkpoint in {}", outcome.updates, Run::last(&self.out).display());
+            rcwm_models::outln!(
+                "{} updates; checkpoint in {}",
+                outcome.updates,
+                Run::last(&self.out).display()
+            );
         }
         Ok(ExitCode::SUCCESS)
     }
@@ -109,7 +114,7 @@ impl Fewshot {
             None => Run::settings(&self.out)?,
             Some(source) => {
                 let mut settings = bars::settings_from(source, Phase::Fewshot, self.preset);
-                settings.from = absolute(self.from.as_deref().unwrap_or(&self.out))?;
+                settings.from = absolute(&Checkpoint::locate(self.from.as_deref().unwrap_or(&self.out))?)?;
                 settings.reset.parts = self.reset;
                 if self.separate_rates {
                     let world = &mut settings.world;
@@ -125,7 +130,7 @@ impl Fewshot {
         if let Some(task) = &self.task {
             settings.task.clone_from(task);
         }
-        let resolved = settings::with_overrides(&settings, &self.overrides)?;
+        let resolved = bars::changed(&settings, &self.overrides)?;
         if resolved.model != settings.model {
             let text = "the sizes of the model are those of the checkpoint: --set model... has no place here";
             return Err(SettingsError::Invalid(text.into()).into());
@@ -136,14 +141,16 @@ impl Fewshot {
 
 fn load(settings: &TrainingSettings) -> Result<Replay> {
     let fewshot = &settings.fewshot;
+    bars::tell(&Folder::list_task(&settings.data, &settings.task)?.notes());
     let bar = ProgressBar::new(fewshot.demonstrations as u64)
         .with_style(ProgressStyle::with_template("loading {wide_bar} {pos}/{len} demonstrations")?);
+    let bar = bars::Bar::new(bar, "loading", "demonstrations");
     let replay =
         demonstrations(&settings.data, &settings.task, fewshot, settings.replay.capacity_steps, || {
             bar.inc(1)
         })?;
     bar.finish_and_clear();
-    println!("{} demonstrations, {} steps", replay.episodes(), replay.steps());
+    rcwm_models::outln!("{} demonstrations, {} steps", replay.episodes(), replay.steps());
     Ok(replay)
 }
 

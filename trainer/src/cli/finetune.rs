@@ -2,12 +2,13 @@ use std::path::PathBuf;
 use std::process::ExitCode;
 
 use anyhow::Result;
+use rcwm_trainer::checkpoint::Checkpoint;
 use rcwm_trainer::training::{Phase, Reset};
 
 use super::bars::{self, absolute};
 use super::online::Online;
 
-/// The rates of the two sides with --separate-rates (spec: phases 4).
+/// The rates of the two sides with --separate-rates.
 const ENVIRONMENT_RATE: f64 = 1e-4;
 const ROBOT_RATE: f64 = 5e-5;
 
@@ -30,7 +31,7 @@ of the environment. Ctrl-C saves; --resume brings back weights, optimisers, coun
 replay, and the simulators begin new episodes.")]
 pub struct Finetune {
     /// Checkpoint of the model to start from
-    #[arg(long, value_name = "CHECKPOINT", required_unless_present = "resume")]
+    #[arg(long, value_name = "CHECKPOINT", required_unless_present = "resume", conflicts_with = "resume")]
     from: Option<PathBuf>,
     /// Amounts to start from [default: those of the checkpoint's preset, else small]
     #[arg(long, value_enum, conflicts_with = "resume")]
@@ -54,7 +55,8 @@ impl Finetune {
         self.online.run(source.as_ref(), || {
             let source = source.as_ref().ok_or_else(|| anyhow::anyhow!("--from is missing"))?;
             let mut settings = bars::settings_from(source, Phase::Finetune, self.preset);
-            settings.from = absolute(self.from.as_deref().unwrap_or(&self.online.out))?;
+            let from = Checkpoint::locate(self.from.as_deref().unwrap_or(&self.online.out))?;
+            settings.from = absolute(&from)?;
             settings.reset.parts = self.reset;
             settings.reset.keep_behaviour = self.keep_behaviour;
             if self.separate_rates {

@@ -43,7 +43,7 @@ impl Init {
             model,
         };
         Checkpoint { settings, parameters }.write(&self.out)?;
-        println!("untrained checkpoint in {}", self.out.display());
+        rcwm_models::outln!("untrained checkpoint in {}", self.out.display());
         Ok(ExitCode::SUCCESS)
     }
 }

@@ -24,6 +24,7 @@ use anyhow::{Context, Result};
 use candle_core::Device;
 use clap::{Parser, Subcommand, ValueEnum};
 use rcwm_gpu::{Machine, Precision};
+use rcwm_models::files::Output;
 use rcwm_models::settings::{self, ModelKind, ModelSettings, Preset};
 use rcwm_trainer::training::Compute;
 
@@ -211,9 +212,76 @@ fn stop_on_ctrl_c() -> Result<Arc<AtomicBool>> {
     Ok(stop)
 }
 
+/// Makes sure before the work that what it measures can be written.
+fn prepare_json(path: Option<&Path>) -> Result<()> {
+    let Some(path) = path else { return Ok(()) };
+    rcwm_models::files::prepare_output(path, Output::Json).context("--json")
+}
+
 /// Writes what a verb measured as JSON.
 fn write_json(path: &Path, value: &impl serde::Serialize) -> Result<()> {
     let mut text = serde_json::to_vec_pretty(value)?;
     text.push(b'\n');
-    rcwm_models::files::write_atomic(path, &text).with_context(|| format!("--json {}", path.display()))
+    rcwm_models::files::write_output(path, &text).context("--json")
+}
+
+#[cfg(test)]
+mod tests {
+    use clap::CommandFactory;
+    use rcwm_models::help::{examples, missing_file};
+
+    use super::*;
+
+    /// The help texts of the program and of all its verbs.
+    fn help_texts() -> Vec<String> {
+        let command = Arguments::command();
+        let all = std::iter::once(command.clone()).chain(command.get_subcommands().cloned());
+        all.map(|mut command| command.render_long_help().ansi().to_string()).collect()
+    }
+
+    #[test]
+    fn every_example_is_understood_and_names_files_that_are_shipped() {
+        let root = std::path::Path::new(env!("CARGO_MANIFEST_DIR")).join("..");
+        let found: Vec<_> = help_texts().iter().flat_map(|text| examples(text, "rcwm-trainer")).collect();
+        assert!(found.len() > 25, "{found:?}");
+        for example in found {
+            let parsed = Arguments::try_parse_from(&example);
+            assert!(
+                parsed.is_ok(),
+                "{example:?}: {}",
+                parsed.err().map_or_else(String::new, |e| e.to_string())
+            );
+            assert_eq!(missing_file(&example, &root), None, "{example:?}");
+        }
+    }
+
+    #[test]
+    fn options_that_would_be_ignored_are_refused() {
+        for refused in [
+            "fewshot --resume --out o --from c",
+            "fewshot --resume --out o --task reach",
+            "finetune --resume --out o --from c",
+            "train --resume --out o --seed 3",
+            "collect --join a --out o --disturb noise",
+            "collect --join a --out o --steps-max 9",
+            "collect --join a --out o --simulators 2",
+            "evaluate --checkpoint c --data d --episodes 4",
+            "evaluate --checkpoint c --data d --disturb noise",
+            "evaluate --checkpoint c --task reach --trajectories 4",
+            "evaluate --checkpoint c --task reach --device cpu",
+            "parameters --checkpoint c --preset small",
+        ] {
+            let words = std::iter::once("program").chain(refused.split_whitespace());
+            assert!(Arguments::try_parse_from(words).is_err(), "{refused}");
+        }
+        for taken in [
+            "fewshot --resume --out o --data d",
+            "evaluate --checkpoint c --data d --trajectories 4",
+            "evaluate --checkpoint c --task reach --episodes 4",
+            "evaluate --report r --checkpoint c --data d --bundles b --episodes 4 --trajectories 4",
+        ] {
+            let words = std::iter::once("program").chain(taken.split_whitespace());
+            assert!(Arguments::try_parse_from(words).is_ok(), "{taken}");
+        }
+    }
 }

@@ -6,10 +6,10 @@ use std::sync::atomic::{AtomicBool, Ordering};
 
 use anyhow::Result;
 use candle_core::Device;
-use indicatif::ProgressBar;
-use rcwm_models::settings::{self, SettingsError};
+use rcwm_models::settings::SettingsError;
 use rcwm_models::tasks::task_id;
 use rcwm_trainer::checkpoint::Checkpoint;
+use rcwm_trainer::replay::Folder;
 use rcwm_trainer::training::{
     EvaluationFacts, Finetuning, Line, OnlineOutcome, OnlineProgress, Phase, Run, TrainingError,
     TrainingSettings,
@@ -102,7 +102,11 @@ impl Online {
         }
         settings.finetune.masks |= self.masks;
         settings.seed = self.seed.unwrap_or(settings.seed);
-        let resolved = settings::with_overrides(&settings, &self.overrides)?;
+        if self.seed.is_some() && self.overrides.iter().any(|change| change.trim_start().starts_with("seed="))
+        {
+            anyhow::bail!("--set seed=... beside --seed: leave one out");
+        }
+        let resolved = bars::changed(&settings, &self.overrides)?;
         if resolved.model != settings.model && settings.phase == Phase::Finetune {
             let text = "the sizes of the model are those of the checkpoint: --set model... has no place here";
             return Err(SettingsError::Invalid(text.into()).into());
@@ -118,22 +122,26 @@ impl Online {
     ) -> Result<OnlineOutcome> {
         let finetune = &settings.finetune;
         let random = finetune.random_steps.div_ceil(u64::from(finetune.episode_steps));
+        if !settings.data.as_os_str().is_empty() {
+            bars::tell(&Folder::list_task(&settings.data, &settings.task)?.notes());
+        }
         let bar = collect::bar(finetune.expert_episodes + random, finetune.episode_steps)?;
         let filled = training.prefill(stop, &|seen| collect::advance(&bar, seen))?;
         bar.finish_and_clear();
-        println!(
+        rcwm_models::outln!(
             "replay: {} episodes, {} steps; {} of them successful demonstrations",
             filled.replay.episodes(),
             filled.replay.steps(),
             filled.demonstrations
         );
         if stop.load(Ordering::Relaxed) {
-            println!("stopped while the replay was filled; go on with --resume");
+            rcwm_models::outln!("stopped while the replay was filled; go on with --resume");
         }
         let state = training.state();
-        let bar = Bars::new(settings, state.updates, state.policy_steps);
+        let mut bar = Bars::new(settings, state.updates, state.policy_steps);
         let outcome = training.run(filled, &self.join, stop, |progress| bar.show(progress))?;
         bar.bar.finish_and_clear();
+        drop(bar);
         Ok(outcome)
     }
 
@@ -143,22 +151,24 @@ impl Online {
             format!(", success in {:.0}% of the newest {newest}", 100.0 * rate)
         });
         let OnlineOutcome { updates, policy_steps, episodes, refused_actions, .. } = outcome;
-        println!("{policy_steps} steps, {episodes} episodes{rate}; {updates} updates");
+        rcwm_models::outln!("{policy_steps} steps, {episodes} episodes{rate}; {updates} updates");
         if *refused_actions > 0 {
-            println!("{refused_actions} actions were not finite; zeros were sent in their place");
+            rcwm_models::outln!("{refused_actions} actions were not finite; zeros were sent in their place");
         }
         let (verb, out) = (settings.phase.verb(), self.out.display());
         if outcome.interrupted {
-            println!("stopped and saved; go on with {verb} --resume --out {out}");
+            rcwm_models::outln!("stopped and saved; go on with {verb} --resume --out {out}");
         } else {
-            println!("checkpoint in {}", Run::last(&self.out).display());
+            rcwm_models::outln!("checkpoint in {}", Run::last(&self.out).display());
         }
     }
 }
 
 /// A bar of warm-up updates, then of steps.
 struct Bars {
-    bar: ProgressBar,
+    bar: bars::Bar,
+    /// The bar is one of the warm-up's updates.
+    warms_up: bool,
     warm_up: u64,
     steps: u64,
 }
@@ -167,17 +177,20 @@ impl Bars {
     fn new(settings: &TrainingSettings, updates: u64, steps: u64) -> Self {
         let warm_up = settings.finetune.warm_up_updates;
         let all = settings.finetune.steps;
-        let bar = if updates < warm_up { bars::updates(warm_up, updates) } else { bars::updates(all, steps) };
-        Self { bar, warm_up, steps: all }
+        let (bar, unit) = match updates < warm_up {
+            true => (bars::updates(warm_up, updates), "updates of the warm-up"),
+            false => (bars::updates(all, steps), "steps"),
+        };
+        Self { bar: bars::Bar::new(bar, "", unit), warms_up: updates < warm_up, warm_up, steps: all }
     }
 
-    fn show(&self, progress: &OnlineProgress<'_>) {
+    fn show(&mut self, progress: &OnlineProgress<'_>) {
         if progress.updates < self.warm_up {
             self.bar.set_position(progress.updates);
         } else {
-            if self.bar.length() != Some(self.steps) {
-                self.bar.set_length(self.steps);
-                self.bar.reset_eta();
+            if std::mem::take(&mut self.warms_up) {
+                self.bar.finish_and_clear();
+                self.bar = bars::Bar::new(bars::updates(self.steps, progress.policy_steps), "", "steps");
             }
             self.bar.set_position(progress.policy_steps);
         }
@@ -194,7 +207,7 @@ impl Bars {
             let facts = &line.episode;
             let solved = if facts.success { "solved" } else { "not solved" };
             let text = format!("episode {}: {solved}, return {:.1}", facts.number, facts.total_reward);
-            self.bar.println(text);
+            self.bar.say(&text);
         }
     }
 }

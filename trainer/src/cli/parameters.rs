@@ -35,9 +35,9 @@ pub struct Parameters {
 }
 
 #[derive(Serialize)]
-struct Table {
+struct Table<'a> {
     settings: ModelSettings,
-    parts: Vec<Part>,
+    parts: &'a [Part],
     total: usize,
 }
 
@@ -49,6 +49,7 @@ struct Spectra<'a> {
 
 impl Parameters {
     pub fn run(self) -> Result<ExitCode> {
+        super::prepare_json(self.json.as_deref())?;
         match &self.checkpoint {
             Some(folder) => self.weights(folder)?,
             None => self.parts()?,
@@ -60,34 +61,42 @@ impl Parameters {
         let settings = self.model.settings()?;
         let parts = agent::parts(&settings)?;
         let total = parts.iter().map(|part| part.parameters).sum();
-        println!("{:<24} {:>12}", "part", "parameters");
-        for part in &parts {
-            println!("{:<24} {:>12}", part.name, part.parameters);
-        }
-        println!("{:<24} {:>12}  ({:.1} M)", "total", total, total as f64 / 1e6);
         if let Some(path) = &self.json {
-            super::write_json(path, &Table { settings, parts, total })?;
+            super::write_json(path, &Table { settings, parts: &parts, total })?;
         }
+        rcwm_models::outln!("{:<24} {:>12}", "part", "parameters");
+        for part in &parts {
+            rcwm_models::outln!("{:<24} {:>12}", part.name, part.parameters);
+        }
+        rcwm_models::outln!("{:<24} {:>12}  ({:.1} M)", "total", total, total as f64 / 1e6);
         Ok(())
     }
 
     fn weights(&self, folder: &Path) -> Result<()> {
         let Checkpoint { settings, parameters } = Checkpoint::read(folder, &Device::Cpu)?;
         let matrices = spectrum::summarise(&parameters)?;
-        println!("{}: {}, {} updates", folder.display(), settings.preset, settings.updates);
-        print(&matrices);
         if let Some(path) = &self.json {
             super::write_json(path, &Spectra { checkpoint: &settings, matrices: &matrices })?;
         }
+        rcwm_models::outln!("{}: {}, {} updates", folder.display(), settings.preset, settings.updates);
+        print(&matrices);
         Ok(())
     }
 }
 
 fn print(matrices: &[MatrixSummary]) {
     let width = matrices.iter().map(|matrix| matrix.name.len()).max().unwrap_or(0);
-    println!(
+    rcwm_models::outln!(
         "{:<width$} {:>12} {:>9} {:>9} {:>9} {:>14} {:>6} {:>6} {:>8}",
-        "matrix", "shape", "s1", "s2", "s3", "rank", "share", "dead", "norm"
+        "matrix",
+        "shape",
+        "s1",
+        "s2",
+        "s3",
+        "rank",
+        "share",
+        "dead",
+        "norm"
     );
     for matrix in matrices {
         let shape = matrix.shape.iter().map(ToString::to_string).collect::<Vec<_>>().join("x");
@@ -95,7 +104,7 @@ fn print(matrices: &[MatrixSummary]) {
             |index| matrix.singular_values.get(index).map_or_else(String::new, |value| number(*value));
         let side = matrix.rows.min(matrix.columns);
         let flag = matrix.flag.map_or_else(String::new, |flag| format!("  <- {}", flag.label()));
-        println!(
+        rcwm_models::outln!(
             "{:<width$} {shape:>12} {:>9} {:>9} {:>9} {:>6.1} of {side:>4} {:>4.0} % {:>4.0} % {:>8}{flag}",
             matrix.name,
             value(0),
@@ -108,7 +117,7 @@ fn print(matrices: &[MatrixSummary]) {
         );
     }
     let flagged = |flag| matrices.iter().filter(|matrix| matrix.flag == Some(flag)).count();
-    println!(
+    rcwm_models::outln!(
         "{} matrices: {} of rank 1, {} with dead units, {} all zero",
         matrices.len(),
         flagged(Flag::RankOne),

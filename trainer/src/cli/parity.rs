@@ -39,30 +39,34 @@ struct Outcome<'a> {
 
 impl Parity {
     pub fn run(self) -> Result<ExitCode> {
+        super::prepare_json(self.json.as_deref())?;
         let groups = if self.groups.is_empty() { Group::ALL.to_vec() } else { self.groups.clone() };
         let report = match self.compute.compute()? {
             Compute::Tensors(device) => parity::check_file(&self.file, &groups, &device)?,
             Compute::Programs(machine) => {
-                println!("updates by programs of kernels on {}", machine.name());
+                rcwm_models::outln!("updates by programs of kernels on {}", machine.name());
                 parity::check_programs(&self.file, &groups, machine)?
             }
         };
-        print(&report);
         if let Some(path) = &self.json {
             super::write_json(path, &Outcome { file: &self.file, passes: report.passes(), report: &report })?;
         }
+        print(&report);
         Ok(if report.passes() { ExitCode::SUCCESS } else { ExitCode::FAILURE })
     }
 }
 
 fn print(report: &Report) {
-    println!(
+    rcwm_models::outln!(
         "{:<17} {:>7} {:>10} {:>10}            worst tensor",
-        "group", "tensors", "max error", "tolerance"
+        "group",
+        "tensors",
+        "max error",
+        "tolerance"
     );
     for group in &report.groups {
         let worst = group.worst();
-        println!(
+        rcwm_models::outln!(
             "{:<17} {:>7} {:>10.2e} {:>10.0e} {}  {:<5}  {}",
             group.group.as_str(),
             group.comparisons.len(),
@@ -77,15 +81,15 @@ fn print(report: &Report) {
         );
     }
     for unchecked in &report.unchecked {
-        println!("{:<17} {:>7} not checked", unchecked.prefix, unchecked.tensors);
+        rcwm_models::outln!("{:<17} {:>7} not checked", unchecked.prefix, unchecked.tensors);
     }
     let failed = report.groups.iter().filter(|group| !group.passes()).count();
     let left: usize = report.unchecked.iter().map(|unchecked| unchecked.tensors).sum();
     match failed {
-        0 => println!(
+        0 => rcwm_models::outln!(
             "all {} groups within tolerance; {left} tensors of the file not checked",
             report.groups.len()
         ),
-        _ => println!("{failed} of {} groups beyond tolerance", report.groups.len()),
+        _ => rcwm_models::outln!("{failed} of {} groups beyond tolerance", report.groups.len()),
     }
 }

@@ -1,11 +1,11 @@
 use std::path::{Path, PathBuf};
 use std::process::ExitCode;
 use std::sync::atomic::Ordering;
-use std::time::{Duration, Instant};
+use std::time::Instant;
 
 use anyhow::{Context, Result};
 use indicatif::{MultiProgress, ProgressBar, ProgressStyle};
-use rcwm_models::settings;
+use rcwm_models::terminal::LINE_EVERY;
 use rcwm_trainer::replay::{Folder, Replay};
 use rcwm_trainer::training::{
     HeldOutLosses, Metrics, Pretraining, Progress, Run, TrainingError, TrainingSettings,
@@ -140,10 +140,18 @@ impl Pretrain {
         for (out, outcome) in outcomes {
             match outcome {
                 Ok(outcome) if outcome.interrupted => {
-                    println!("stopped and saved after {} updates; {}", outcome.updates, self.go_on());
+                    rcwm_models::outln!(
+                        "stopped and saved after {} updates; {}",
+                        outcome.updates,
+                        self.go_on()
+                    );
                 }
                 Ok(outcome) => {
-                    println!("{} updates; checkpoint in {}", outcome.updates, Run::last(out).display());
+                    rcwm_models::outln!(
+                        "{} updates; checkpoint in {}",
+                        outcome.updates,
+                        Run::last(out).display()
+                    );
                 }
                 Err(error) => failed = Some(anyhow::Error::from(error).context(out.display().to_string())),
             }
@@ -175,7 +183,7 @@ impl Pretrain {
         if let Some(masks) = &self.masks {
             settings.masks = absolute(masks)?;
         }
-        let mut resolved = settings::with_overrides(&settings, &self.overrides)?;
+        let mut resolved = bars::changed(&settings, &self.overrides)?;
         if resolved.model != settings.model {
             resolved.preset = "custom".to_owned();
         }
@@ -186,12 +194,14 @@ impl Pretrain {
 fn load(settings: &TrainingSettings) -> Result<Replay> {
     let masks = Some(settings.masks.as_path()).filter(|path| !path.as_os_str().is_empty());
     let folder = Folder::list(&settings.data, masks)?;
+    bars::tell(&folder.notes());
     let bar = ProgressBar::new(folder.len() as u64)
         .with_style(ProgressStyle::with_template("loading {wide_bar} {pos}/{len} episodes")?);
+    let bar = bars::Bar::new(bar, "loading", "episodes");
     let replay = folder.load(settings.replay.capacity_steps, || bar.inc(1))?;
     bar.finish_and_clear();
     let masked = replay.masked();
-    println!(
+    rcwm_models::outln!(
         "{} episodes, {} steps of {} tasks; with masks {} episodes, {} steps",
         replay.episodes(),
         replay.steps(),
@@ -202,25 +212,20 @@ fn load(settings: &TrainingSettings) -> Result<Replay> {
     Ok(replay)
 }
 
-/// Without a terminal, time between two lines.
-const LINE_EVERY: Duration = Duration::from_secs(10);
-
 fn show(bar: &ProgressBar, name: &str, shown: &mut Instant, progress: &Progress<'_>) {
     bar.set_position(progress.updates);
-    if let (true, Some(metrics), true) = (bar.is_hidden(), progress.metrics, shown.elapsed() >= LINE_EVERY) {
+    if let Some(metrics) = progress.metrics {
+        bar.set_message(describe(metrics));
+    }
+    if bar.is_hidden() && shown.elapsed() >= LINE_EVERY {
         *shown = Instant::now();
         let (done, all) = (progress.updates, bar.length().unwrap_or_default());
-        println!("{name}{done} of {all} updates, ETA {:.0?}  {}", bar.eta(), describe(metrics));
+        rcwm_models::errln!("{name}{done} of {all} updates, ETA {:.0?}  {}", bar.eta(), bar.message());
     }
     if let Some(HeldOutLosses { update, held_out, best }) = progress.held_out {
         let best = if *best { ", the best so far" } else { "" };
-        bar.println(format!(
-            "{name}{update} updates: held-out loss {:.1}, image {:.1}{best}",
-            held_out.total, held_out.image
-        ));
-    }
-    if let Some(metrics) = progress.metrics {
-        bar.set_message(describe(metrics));
+        let (total, image) = (held_out.total, held_out.image);
+        bars::say(bar, &format!("{name}{update} updates: held-out loss {total:.1}, image {image:.1}{best}"));
     }
 }
 

@@ -17,6 +17,8 @@ use rcwm_trainer::report::{
     UNDISTURBED, policies, shown_path,
 };
 
+use super::bars::{self, Bar};
+
 /// What goes into a report.
 #[derive(Debug, clap::Args)]
 #[command(next_help_heading = "Report")]
@@ -86,8 +88,11 @@ impl Inputs<'_> {
         }
         let page = folder.join("index.html");
         match measured + found {
-            0 => println!("drawn anew: {}", page.display()),
-            _ => println!("{measured} parts measured, {found} were there; the page is {}", page.display()),
+            0 => rcwm_models::outln!("drawn anew: {}", page.display()),
+            _ => rcwm_models::outln!(
+                "{measured} parts measured, {found} were there; the page is {}",
+                page.display()
+            ),
         }
         ensure!(outcome.is_ok(), "interrupted; what was measured is kept, the same command goes on");
         Ok(())
@@ -147,7 +152,7 @@ impl Work<'_> {
         }
         let (policies, left_out) = policies(&self.inputs.arguments.bundles)?;
         for reason in left_out {
-            println!("left out: {reason}");
+            rcwm_models::outln!("left out: {reason}");
         }
         let mut jobs = Vec::new();
         for disturb in disturbances(self.inputs.disturb) {
@@ -183,7 +188,11 @@ impl Work<'_> {
         let (successes, episodes) = (found.successes, found.episodes);
         bar.suspend(|| {
             let disturb = &settings.disturb;
-            println!("{} on {}, disturbance {disturb}: {successes} of {episodes}", policy.name, policy.task);
+            rcwm_models::outln!(
+                "{} on {}, disturbance {disturb}: {successes} of {episodes}",
+                policy.name,
+                policy.task
+            );
         });
         self.store.keep(draft, source, found, self.made(), begin.elapsed().as_secs_f64())?;
         self.measured += 1;
@@ -224,7 +233,9 @@ impl Work<'_> {
             .map(|(name, data)| (name.as_str(), data.as_path(), None));
         let mut found = Vec::new();
         for (disturb, path, masks) in undisturbed.into_iter().chain(disturbed) {
-            for (task, folder) in Folder::list(path, masks)?.by_task() {
+            let listed = Folder::list(path, masks)?;
+            bars::tell(&listed.notes());
+            for (task, folder) in listed.by_task() {
                 let sha256 = folder.sha256()?;
                 found.push(TaskData { disturb: disturb.to_owned(), task, folder, sha256 });
             }
@@ -309,13 +320,18 @@ impl Work<'_> {
             let bar = ProgressBar::new(data.folder.len() as u64)
                 .with_style(ProgressStyle::with_template("loading {msg} {wide_bar} {pos}/{len} episodes")?)
                 .with_message(data.task.clone());
+            let bar = Bar::new(bar, "loading", "episodes");
             let read = Recordings::load(&data.folder, || bar.inc(1));
             bar.finish_and_clear();
             *recordings = Some(read?);
         }
         let found = recordings.as_ref().filter(|recordings| !recordings.is_empty());
         if found.is_none() {
-            println!("{}, disturbance {}: no episode has masks, not measured", data.task, data.disturb);
+            rcwm_models::outln!(
+                "{}, disturbance {}: no episode has masks, not measured",
+                data.task,
+                data.disturb
+            );
         }
         Ok(found)
     }
@@ -343,11 +359,11 @@ fn command() -> String {
     std::iter::once("rcwm-trainer".to_owned()).chain(words).collect::<Vec<_>>().join(" ")
 }
 
-fn bar(all: u64, unit: &str) -> Result<ProgressBar> {
+fn bar(all: u64, unit: &'static str) -> Result<Bar> {
     let template = format!("{{msg}} {{wide_bar}} {{pos}}/{{len}} {unit}, ETA {{eta}}");
     let bar = ProgressBar::new(all).with_style(ProgressStyle::with_template(&template)?);
     bar.enable_steady_tick(Duration::from_millis(200));
-    Ok(bar)
+    Ok(Bar::new(bar, "measuring", unit))
 }
 
 #[cfg(test)]

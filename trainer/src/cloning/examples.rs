@@ -70,16 +70,22 @@ impl Examples {
         Self { features, actions }
     }
 
+    /// The places of a batch's examples among its B * T steps.
+    #[must_use]
+    pub fn places_in(batch: &Batch) -> Vec<u32> {
+        let (first, pushed) = (batch.first.flags(), &batch.pushed);
+        let length = first.len() / batch.first.batch().max(1);
+        let goes_on =
+            |index: &usize| !(index + 1).is_multiple_of(length) && !first[index + 1] && !pushed[index + 1];
+        (0..first.len()).filter(goes_on).map(|index| index as u32).collect()
+    }
+
     /// The examples in a batch, from its posterior features [B, T, state width]: features [N, state width] and actions [N, action].
     ///
     /// # Errors
     /// Those of candle, also if there is none.
     pub fn of_batch(features: &Tensor, batch: &Batch) -> Result<(Tensor, Tensor)> {
-        let (first, pushed, actions) = (batch.first.flags(), &batch.pushed, &batch.action);
-        let length = features.dim(1)?;
-        let goes_on =
-            |index: &usize| !(index + 1).is_multiple_of(length) && !first[index + 1] && !pushed[index + 1];
-        let chosen: Vec<u32> = (0..first.len()).filter(goes_on).map(|index| index as u32).collect();
+        let (chosen, actions) = (Self::places_in(batch), &batch.action);
         let next: Vec<u32> = chosen.iter().map(|index| index + 1).collect();
         let pick = |x: &Tensor, indices: Vec<u32>| {
             let count = indices.len();
@@ -110,6 +116,9 @@ impl Examples {
         let mut generator = ChaCha8Rng::seed_from_u64(seed);
         generator.set_stream(number);
         let count = self.count()? as u32;
+        if count == 0 {
+            return Err(candle_core::Error::Msg("no demonstration holds an action to learn from".into()));
+        }
         let chosen: Vec<u32> = (0..rows).map(|_| generator.random_range(0..count)).collect();
         let chosen = Tensor::from_vec(chosen, rows, self.features.device())?;
         Ok((self.features.index_select(&chosen, 0)?, self.actions.index_select(&chosen, 0)?))

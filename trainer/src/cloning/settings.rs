@@ -55,7 +55,7 @@ pub struct CloningSettings {
 }
 
 impl Default for CloningSettings {
-    /// The weights are the few-shot experiment's (spec: phases 6).
+    /// The weights are those of the few-shot phase.
     fn default() -> Self {
         Self {
             loss: CloningLoss::SquaredError,

@@ -1,4 +1,4 @@
-//! What a model can do (spec, section 4).
+//! What a model can do: robot dynamics (paper, Fig. 4 and 7) and success in closed loop.
 //!
 //! Nouns: a **trajectory** is a stretch of a recorded episode with robot masks, a **window**; its first steps are the **context**, which
 //! the model sees, and the rest is **imagined** with the recorded actions. Windows end before the task is solved and the robot moves in

@@ -7,8 +7,8 @@ use std::path::{Path, PathBuf};
 use ndarray::{ArrayD, IxDyn};
 use rcwm_models::ACTION_LEN;
 use rcwm_models::bundle::{
-    ActionMode, Bundle, Control, FORMAT, FileEntry, InitialState, MANIFEST_FILE, Manifest, PartEntry, PartName,
-    Provenance,
+    ActionMode, Bundle, Control, FORMAT, FileEntry, InitialState, MANIFEST_FILE, Manifest, PartEntry,
+    PartName, Provenance,
 };
 use rcwm_models::files::{sha256_hex, write_atomic};
 use rcwm_models::tensors::{Tensors, Values};

@@ -4,7 +4,7 @@
 //! | --- | --- |
 //! | `settings` | everything that can be chosen, with the paper's values |
 //! | `batch` | sequences of experience as tensors |
-//! | `losses` | image, mask, reward, continuation, KL per branch (spec: losses; eq. 2, 3, 9) |
+//! | `losses` | image, mask, reward, continuation, KL per branch (eq. 2, 3, 9) |
 //! | `look` | how the encoders see what is learned from: disturbed, with other colours |
 //! | `kl` | balanced KL with free bits, per branch |
 //! | `gradients`, `adam` | gradients by name, clipping, the optimiser |

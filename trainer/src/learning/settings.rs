@@ -2,7 +2,7 @@ use serde::{Deserialize, Serialize};
 
 use super::AdamSettings;
 
-/// How the world model learns (spec: losses; paper, Table 2).
+/// How the world model learns (paper, Table 2).
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields, default)]
 pub struct WorldSettings {

@@ -96,11 +96,28 @@ impl WorldLearner {
     /// # Errors
     /// Those of candle.
     pub fn losses(&self, batch: &Batch, sampler: &mut Sampler) -> candle_core::Result<WorldLosses> {
+        self.losses_of_share(batch, examples_a_row(batch), sampler)
+    }
+
+    /// The losses of some rows of a batch that has so many examples a row: a share counts by its rows, but the rows differ in examples.
+    /// So the cloning loss is scaled such that the shares' losses, by their rows, add up to the mean over all examples of the batch.
+    fn losses_of_share(
+        &self,
+        batch: &Batch,
+        in_whole: f64,
+        sampler: &mut Sampler,
+    ) -> candle_core::Result<WorldLosses> {
         let mut losses = world_losses(&self.agent, batch, &self.settings, sampler)?;
         if let Some(imitation) = &self.imitation {
-            let features = losses.observed.posteriors.features()?; // [B, T, state width]
-            let (features, actions) = Examples::of_batch(&features, batch)?;
-            let loss = cloning_loss(&self.agent.actor, &features, &actions, imitation.loss)?;
+            let here = examples_a_row(batch);
+            let loss = if here > 0.0 {
+                let features = losses.observed.posteriors.features()?; // [B, T, state width]
+                let (features, actions) = Examples::of_batch(&features, batch)?;
+                let mean = cloning_loss(&self.agent.actor, &features, &actions, imitation.loss)?;
+                (mean * (here / in_whole))?
+            } else {
+                losses.total.zeros_like()?
+            };
             losses.total = (&losses.total + (&loss * imitation.scale)?)?;
             losses.cloning = Some(loss);
         }
@@ -119,11 +136,11 @@ impl WorldLearner {
         batch: &Batch,
         sampler: &mut Sampler,
     ) -> Result<(WorldLosses, Gradients), LearningError> {
-        let (rows, whole) = (batch.first.batch(), &*sampler);
+        let (rows, whole, examples) = (batch.first.batch(), &*sampler, examples_a_row(batch));
         let share = |rows_here: Range<usize>| {
             let mut sampler = whole.share(rows_here.clone(), rows);
             let weight = rows_here.len() as f64 / rows as f64;
-            let losses = self.losses(&batch.rows(&rows_here)?, &mut sampler)?;
+            let losses = self.losses_of_share(&batch.rows(&rows_here)?, examples, &mut sampler)?;
             let gradients = part("world backward", || {
                 Gradients::of_share(&(&losses.total * weight)?, &self.parameters, self.trained.filter())
             })?;
@@ -169,4 +186,9 @@ impl WorldLearner {
             posteriors: losses.observed.posteriors,
         })
     }
+}
+
+/// Examples of a batch for the actor, by its rows.
+fn examples_a_row(batch: &Batch) -> f64 {
+    Examples::places_in(batch).len() as f64 / batch.first.batch().max(1) as f64
 }

@@ -1,4 +1,4 @@
-//! How parameters start (spec: initial weights), drawn from the trainer's own seeded generator.
+//! How parameters start (as in DreamerV3), drawn from the trainer's own seeded generator.
 
 use rand::{Rng, SeedableRng};
 use rand_chacha::ChaCha8Rng;

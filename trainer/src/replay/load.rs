@@ -3,11 +3,10 @@ use std::fs;
 use std::io;
 use std::path::{Path, PathBuf};
 
-use ndarray::Array3;
-use rcwm_models::IMAGE_SIDE;
 use rcwm_models::episode::{EPISODE_BYTES_MAX, Episode, EpisodeError};
 use rcwm_models::files::{FileError, read_capped, sha256_hex};
 
+use super::masks::read_masks;
 use super::{Replay, ReplayError};
 
 /// Why data could not be loaded.
@@ -22,10 +21,23 @@ pub enum LoadError {
         source: io::Error,
     },
     /// It holds no episodes.
-    #[error("data: {path} holds no .npz files, neither right there nor one folder down; collect some first")]
+    #[error(
+        "data: {path} holds no .npz files, neither right there nor one folder down; {}",
+        elsewhere(deeper)
+    )]
     NoEpisodes {
         /// The folder.
         path: PathBuf,
+        /// A folder further down that has some.
+        deeper: Option<PathBuf>,
+    },
+    /// A folder of masks that does not exist, or has none of any episode.
+    #[error("masks: {path}: {reason}")]
+    NoMasks {
+        /// The folder.
+        path: PathBuf,
+        /// What was found, and what was looked for.
+        reason: String,
     },
     /// A file could not be read.
     #[error("data: {0}")]
@@ -41,16 +53,18 @@ pub enum LoadError {
         /// Why.
         source: ReplayError,
     },
-    /// A mask is no readable picture.
+    /// A mask is no readable picture, or it cannot be told what it shows.
     #[error("masks: {path}: {reason}")]
     Mask {
-        /// The picture.
+        /// The picture, or the folder of an episode's.
         path: PathBuf,
         /// What is wrong.
         reason: String,
     },
     /// There is not one mask for every step.
-    #[error("masks: {path} holds {found} pictures, the episode has {expected} steps; it needs one for each")]
+    #[error(
+        "masks: {path} holds {found} pictures (.png), the episode has {expected} steps; it needs one for each"
+    )]
     MaskCount {
         /// The folder.
         path: PathBuf,
@@ -61,39 +75,109 @@ pub enum LoadError {
     },
 }
 
+fn elsewhere(deeper: &Option<PathBuf>) -> String {
+    match deeper {
+        Some(path) => format!("{} has some: name that folder, or put one folder a task", path.display()),
+        None => "collect some first".to_owned(),
+    }
+}
+
 /// A folder of episodes, listed in a fixed order but not yet read.
 #[derive(Debug, Clone)]
 pub struct Folder {
     files: Vec<(String, PathBuf)>,
     masks: Option<PathBuf>,
+    left_out: Vec<PathBuf>,
 }
 
 impl Folder {
     /// Lists `path`: one sub-folder a task, or the files right in it as the one task with the folder's name. `masks` is an
     /// optional folder of masks as pictures, `task/episode/*.png`; they replace those in the files.
     ///
+    /// Where Dreamer's own programs wrote the folder it is read as they do: `train_eps` of a log folder or of a task's holds the
+    /// episodes to learn from, and `eval_eps` those that nobody may learn from; they are left out unless they are named themselves.
+    ///
     /// # Errors
-    /// [`LoadError::Folder`] or [`LoadError::NoEpisodes`].
+    /// [`LoadError::Folder`], [`LoadError::NoEpisodes`] or [`LoadError::NoMasks`].
     pub fn list(path: &Path, masks: Option<&Path>) -> Result<Self, LoadError> {
-        let mut files = Vec::new();
+        let mut found = Self { files: Vec::new(), masks: masks.map(Path::to_path_buf), left_out: Vec::new() };
+        if path.is_file() {
+            let source = io::Error::other("a file; expected the folder of episodes that holds it");
+            return Err(LoadError::Folder { path: path.to_path_buf(), source });
+        }
         let own = name_of(path);
-        for entry in sorted(path)? {
-            if entry.is_dir() {
-                let task = name_of(&entry);
-                files.extend(
-                    sorted(&entry)?
-                        .into_iter()
-                        .filter(|file| is(file, "npz"))
-                        .map(|file| (task.clone(), file)),
-                );
-            } else if is(&entry, "npz") {
-                files.push((own.clone(), entry));
+        found.add(&own, path)?;
+        for entry in sorted(path)?.into_iter().filter(|entry| entry.is_dir()) {
+            let name = name_of(&entry);
+            if is_train(&name) || is_evaluation(&name) {
+                continue; // looked at as parts of the folder itself
+            }
+            found.add(&name, &entry)?;
+        }
+        if found.files.is_empty() {
+            return Err(LoadError::NoEpisodes {
+                path: path.to_path_buf(),
+                deeper: search(path, SEARCH_DEPTH),
+            });
+        }
+        found.check_masks()?;
+        Ok(found)
+    }
+
+    /// Adds the episodes right in a folder, and those to train on that a run of Dreamer has put one folder further down.
+    fn add(&mut self, task: &str, folder: &Path) -> Result<(), LoadError> {
+        let mut files = files_in(folder)?;
+        for entry in sorted(folder)?.into_iter().filter(|entry| entry.is_dir()) {
+            let name = name_of(&entry);
+            if is_train(&name) {
+                files.extend(files_in(&entry)?);
+            } else if is_evaluation(&name) && !self.left_out.contains(&entry) && !files_in(&entry)?.is_empty()
+            {
+                self.left_out.push(entry);
             }
         }
-        if files.is_empty() {
-            return Err(LoadError::NoEpisodes { path: path.to_path_buf() });
+        self.files.extend(files.into_iter().map(|file| (task.to_owned(), file)));
+        Ok(())
+    }
+
+    /// A folder of masks that is of no use is a mistake of whoever named it.
+    fn check_masks(&self) -> Result<(), LoadError> {
+        let Some(masks) = &self.masks else { return Ok(()) };
+        let fail = |reason: String| Err(LoadError::NoMasks { path: masks.clone(), reason });
+        if !masks.is_dir() {
+            return fail("no such folder".into());
         }
-        Ok(Self { files, masks: masks.map(Path::to_path_buf) })
+        if self.with_mask_pictures() > 0 {
+            return Ok(());
+        }
+        let Some((task, file)) = self.files.first() else { return Ok(()) };
+        let looked_for = masks_of(masks, task, file);
+        let flat = masks.join(file.file_stem().unwrap_or_default());
+        let hint = if flat.is_dir() { "; the folder of the task is missing there" } else { "" };
+        fail(format!("no masks of any episode; looked for {}{hint}", looked_for.display()))
+    }
+
+    /// Episodes whose masks are pictures.
+    #[must_use]
+    pub fn with_mask_pictures(&self) -> usize {
+        let Some(masks) = &self.masks else { return 0 };
+        self.files.iter().filter(|(task, file)| masks_of(masks, task, file).is_dir()).count()
+    }
+
+    /// What is to be told about the folder before it is used: what was left out, and which episodes have masks.
+    #[must_use]
+    pub fn notes(&self) -> Vec<String> {
+        let left_out = self.left_out.iter().map(|folder| {
+            format!(
+                "left out: {} (episodes of evaluation); name the folder itself to use them",
+                folder.display()
+            )
+        });
+        let masks = self.masks.as_ref().map(|masks| {
+            let (count, all) = (self.with_mask_pictures(), self.len());
+            format!("{count} of {all} episodes have masks in {}", masks.display())
+        });
+        left_out.chain(masks).collect()
     }
 
     /// The same episodes, task by task.
@@ -104,7 +188,10 @@ impl Folder {
             let entry = (task.clone(), file.clone());
             match tasks.iter_mut().find(|(name, _)| name == task) {
                 Some((_, folder)) => folder.files.push(entry),
-                None => tasks.push((task.clone(), Self { files: vec![entry], masks: self.masks.clone() })),
+                None => tasks.push((
+                    task.clone(),
+                    Self { files: vec![entry], masks: self.masks.clone(), left_out: Vec::new() },
+                )),
             }
         }
         tasks
@@ -195,43 +282,54 @@ fn masks_of(masks: &Path, task: &str, path: &Path) -> PathBuf {
     masks.join(task).join(path.file_stem().unwrap_or_default())
 }
 
-fn sorted(folder: &Path) -> Result<Vec<PathBuf>, LoadError> {
+/// How far down is looked for episodes that were put elsewhere.
+const SEARCH_DEPTH: usize = 3;
+
+/// The folder of episodes to learn from in a log folder of dreamerv3-torch.
+fn is_train(name: &str) -> bool {
+    matches!(name, "train_eps" | "train_episodes")
+}
+
+/// Episodes that were recorded to judge by; to learn from them would spoil every number that is measured on them.
+fn is_evaluation(name: &str) -> bool {
+    let name = name.to_ascii_lowercase();
+    let whole =
+        ["eval", "evaluation", "test", "val", "valid", "validation", "holdout", "heldout", "held_out"];
+    whole.contains(&name.as_str()) || name.starts_with("eval_") || name.starts_with("eval-")
+}
+
+/// The episodes right in a folder, in the order of their names.
+fn files_in(folder: &Path) -> Result<Vec<PathBuf>, LoadError> {
+    Ok(sorted(folder)?.into_iter().filter(|file| is(file, "npz") && !file.is_dir()).collect())
+}
+
+/// The first folder with episodes below `path`.
+fn search(path: &Path, depth: usize) -> Option<PathBuf> {
+    let below = sorted(path).ok()?;
+    let folders: Vec<_> = below.into_iter().filter(|entry| entry.is_dir()).collect();
+    let direct = folders.iter().find(|folder| files_in(folder).is_ok_and(|files| !files.is_empty()));
+    let deeper = || folders.iter().filter(|_| depth > 0).find_map(|folder| search(folder, depth - 1));
+    direct.cloned().or_else(deeper)
+}
+
+/// What is in a folder, by name, without what is hidden: what a program writes at the moment, or what a system puts beside files.
+pub(super) fn sorted(folder: &Path) -> Result<Vec<PathBuf>, LoadError> {
     let fail = |source| LoadError::Folder { path: folder.to_path_buf(), source };
     let entries = fs::read_dir(folder).map_err(fail)?;
     let mut paths = entries.map(|entry| Ok(entry?.path())).collect::<io::Result<Vec<_>>>().map_err(fail)?;
+    paths.retain(|path| !name_of(path).starts_with('.'));
     paths.sort();
     Ok(paths)
 }
 
-fn is(path: &Path, extension: &str) -> bool {
+pub(super) fn is(path: &Path, extension: &str) -> bool {
     path.extension().is_some_and(|found| found.eq_ignore_ascii_case(extension))
 }
 
+/// The folder's name, also where the path ends in `.` or `..`.
 fn name_of(path: &Path) -> String {
-    path.file_name().map_or_else(|| "data".to_owned(), |name| name.to_string_lossy().into_owned())
-}
-
-/// Reads one picture a step, in the order of their names; brighter than half is the robot.
-fn read_masks(folder: &Path, steps: usize) -> Result<Array3<bool>, LoadError> {
-    let pictures: Vec<_> = sorted(folder)?.into_iter().filter(|file| is(file, "png")).collect();
-    if pictures.len() != steps {
-        let (path, found) = (folder.to_path_buf(), pictures.len());
-        return Err(LoadError::MaskCount { path, found, expected: steps });
-    }
-    let mut masks = Array3::from_elem((steps, IMAGE_SIDE, IMAGE_SIDE), false);
-    for (mut mask, path) in masks.outer_iter_mut().zip(&pictures) {
-        let fail = |reason: String| LoadError::Mask { path: path.clone(), reason };
-        let picture = image::open(path).map_err(|error| fail(error.to_string()))?.into_luma8();
-        let side = IMAGE_SIDE as u32;
-        if picture.dimensions() != (side, side) {
-            let (width, height) = picture.dimensions();
-            return Err(fail(format!("is {width}x{height} pixels, expected {side}x{side}")));
-        }
-        for (robot, pixel) in mask.iter_mut().zip(picture.pixels()) {
-            *robot = pixel.0[0] > 127;
-        }
-    }
-    Ok(masks)
+    let name = |path: &Path| path.file_name().map(|name| name.to_string_lossy().into_owned());
+    name(path).or_else(|| name(&fs::canonicalize(path).ok()?)).unwrap_or_else(|| "data".to_owned())
 }
 
 #[cfg(test)]
@@ -284,7 +382,70 @@ mod tests {
     #[test]
     fn an_empty_folder_is_one_clear_error() {
         let folder = tempfile::tempdir().unwrap();
-        assert!(matches!(Folder::list(folder.path(), None), Err(LoadError::NoEpisodes { .. })));
+        assert!(matches!(Folder::list(folder.path(), None), Err(LoadError::NoEpisodes { deeper: None, .. })));
+        let deep = folder.path().join("a/b/c");
+        fs::create_dir_all(&deep).unwrap();
+        episode(3, 1.0).write(&deep.join("1.npz")).unwrap();
+        let error = Folder::list(folder.path(), None).unwrap_err().to_string();
+        assert!(error.contains("a/b/c has some"), "{error}");
+        let error = Folder::list(&deep.join("1.npz"), None).unwrap_err().to_string();
+        assert!(error.contains("expected the folder"), "{error}");
+    }
+
+    fn put(path: &Path, reward: f32) {
+        fs::create_dir_all(path.parent().unwrap()).unwrap();
+        episode(3, reward).write(path).unwrap();
+    }
+
+    fn rewards(folder: &Path) -> Vec<(String, Vec<f32>)> {
+        let replay = Folder::list(folder, None).unwrap().load(1000, || ()).unwrap();
+        let of = |(name, episodes): (&str, Vec<&std::sync::Arc<Episode>>)| {
+            (name.to_owned(), episodes.iter().map(|episode| episode.reward[0]).collect())
+        };
+        replay.tasks().map(of).collect()
+    }
+
+    #[test]
+    fn episodes_of_evaluation_are_left_out_and_told_unless_they_are_named() {
+        let folder = tempfile::tempdir().unwrap();
+        let (log, base) = (folder.path().join("log"), folder.path().join("base"));
+        for (place, reward) in [("train_eps", 1.0), ("eval_eps", 9.0), ("eval", 9.0)] {
+            put(&log.join(place).join("1.npz"), reward);
+            put(&base.join("hammer").join(place).join("1.npz"), reward);
+        }
+        assert_eq!(rewards(&log), [("log".to_owned(), vec![1.0])]);
+        assert_eq!(rewards(&base), [("hammer".to_owned(), vec![1.0])]);
+        let listed = Folder::list(&log, None).unwrap();
+        assert_eq!(listed.notes().len(), 2, "{:?}", listed.notes());
+        assert_eq!(Folder::list_task(&base, "hammer").unwrap().len(), 1);
+        assert_eq!(rewards(&log.join("eval_eps")), [("eval_eps".to_owned(), vec![9.0])]);
+    }
+
+    #[test]
+    fn links_are_read_and_hidden_files_are_not() {
+        let folder = tempfile::tempdir().unwrap();
+        put(&folder.path().join("store/one"), 4.0);
+        let task = folder.path().join("snapshot/reach");
+        fs::create_dir_all(&task).unwrap();
+        std::os::unix::fs::symlink("../../store/one", task.join("a.npz")).unwrap();
+        fs::write(task.join("._a.npz"), b"what macOS leaves").unwrap();
+        assert_eq!(rewards(&folder.path().join("snapshot")), [("reach".to_owned(), vec![4.0])]);
+        std::os::unix::fs::symlink("reach", folder.path().join("snapshot/again")).unwrap();
+        assert_eq!(rewards(&folder.path().join("snapshot")).len(), 2, "a folder may be a link too");
+    }
+
+    #[test]
+    fn a_folder_of_masks_that_matches_nothing_is_refused_by_name() {
+        let folder = tempfile::tempdir().unwrap();
+        let data = folder.path().join("data");
+        put(&data.join("reach/a.npz"), 1.0);
+        let refused = |masks: &Path| Folder::list(&data, Some(masks)).unwrap_err().to_string();
+        let error = refused(&folder.path().join("maks"));
+        assert!(error.contains("maks") && error.contains("no such folder"), "{error}");
+        let flat = folder.path().join("flat");
+        fs::create_dir_all(flat.join("a")).unwrap();
+        let error = refused(&flat);
+        assert!(error.contains("flat/reach/a") && error.contains("folder of the task is missing"), "{error}");
     }
 
     #[test]

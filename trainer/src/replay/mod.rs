@@ -8,11 +8,12 @@
 //! ```text
 //! data/reach/000017.npz      Dreamer's arrays, see rcwm_models::episode; any file name
 //! data/hammer/...            one folder a task; or the files right in data/
-//! masks/reach/000017/00000.png, 00001.png, ...   optional: masks that a segmenter wrote, one a step, white the robot
+//! masks/reach/000017/00000.png, 00001.png, ...   optional: masks that a segmenter wrote, one a step: white, or the number of an object
 //! ```
 
 mod held_out;
 mod load;
+mod masks;
 mod prefetch;
 mod shared;
 mod store;

@@ -1,4 +1,4 @@
-//! What models can do, as one page (spec, section 4).
+//! What models can do, as one page.
 //!
 //! Nouns: a **part** is one thing that was measured, a policy on a task or a model on a task's trajectories. It is a JSON file in the
 //! report's folder `parts`, with its pictures beside it, and says what it was measured from, its **source**. A part whose source is
@@ -38,6 +38,7 @@ use std::path::PathBuf;
 
 use rcwm_models::bundle::BundleError;
 use rcwm_models::files::FileError;
+use rcwm_models::lock::LockError;
 
 use crate::checkpoint::CheckpointError;
 use crate::evaluation::{ClosedLoopError, ClosedLoopResultsError, EvaluationError};
@@ -54,6 +55,9 @@ pub enum ReportError {
         /// What the operating system said.
         source: std::io::Error,
     },
+    /// Somebody else measures for this report.
+    #[error("report: {0}")]
+    Lock(#[from] LockError),
     /// A file could not be read or written.
     #[error("report: {0}")]
     File(#[from] FileError),

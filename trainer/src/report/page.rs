@@ -211,7 +211,7 @@ mod tests {
     fn an_empty_report_says_what_adds_every_section() {
         let folder = tempfile::tempdir().unwrap();
         let page = page(&Store::open(folder.path()).unwrap());
-        assert_eq!(page.matches("no policy").count(), 12, "all tasks of the spec");
+        assert_eq!(page.matches("no policy").count(), 12, "all tasks of the paper");
         for option in ["--bundles", "--checkpoint", "--data", "--disturb ", "--disturbed-data", "--results"] {
             assert!(page.contains(option), "{option}");
         }

@@ -1,8 +1,10 @@
 use std::ffi::OsStr;
 use std::fs;
 use std::path::{Path, PathBuf};
+use std::sync::Arc;
 
 use rcwm_models::files::{read_capped, sha256_hex, write_atomic};
+use rcwm_models::lock::Lock;
 use serde::de::DeserializeOwned;
 use serde::{Deserialize, Serialize};
 
@@ -48,6 +50,8 @@ pub struct Part<M: Measurement> {
 #[derive(Debug, Clone)]
 pub struct Store {
     folder: PathBuf,
+    /// Nobody else measures here.
+    _lock: Arc<Lock>,
 }
 
 /// A part that is being made: where its pictures go.
@@ -80,11 +84,12 @@ impl Store {
     /// The parts of the report in this folder; both are made where they are missing.
     ///
     /// # Errors
-    /// [`ReportError::Folder`].
+    /// [`ReportError::Folder`], or [`ReportError::Lock`] where somebody else measures for the same report.
     pub fn open(report: &Path) -> Result<Self, ReportError> {
         let folder = report.join("parts");
         fs::create_dir_all(&folder).map_err(|source| ReportError::Folder { path: folder.clone(), source })?;
-        Ok(Self { folder })
+        let lock = Arc::new(Lock::take(&folder)?);
+        Ok(Self { folder, _lock: lock })
     }
 
     /// The part with this source, whole with its pictures; none if there is none, it is of another source, or cannot be read.

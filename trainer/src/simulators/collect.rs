@@ -8,6 +8,8 @@ use rand::{Rng, SeedableRng};
 use rand_chacha::ChaCha8Rng;
 use rcwm_models::ACTION_LEN;
 use rcwm_models::episode::{Episode, EpisodeError};
+use rcwm_models::files::{FileError, free_name};
+use rcwm_models::lock::{Lock, LockError};
 use rcwm_models::tasks::task_name;
 use serde::Serialize;
 
@@ -37,6 +39,9 @@ pub enum CollectError {
         /// The disturbance.
         look: String,
     },
+    /// Somebody else collects into the folder.
+    #[error(transparent)]
+    Lock(#[from] LockError),
     /// A folder could not be made.
     #[error("{path}: {source}")]
     Folder {
@@ -155,6 +160,14 @@ fn run_jobs(
     seen: &(dyn Fn(Seen) + Sync),
     keep: Keep<'_>,
 ) -> Result<Sums, CollectError> {
+    let mut locks = BTreeMap::new();
+    for task in plan.jobs.iter().map(|job| job.task.as_str()) {
+        let folder = settings.out.join(task);
+        make_folder(&folder)?;
+        if !locks.contains_key(task) {
+            locks.insert(task, Lock::take(&folder)?);
+        }
+    }
     let queue = Mutex::new(plan.jobs.iter());
     let failed = AtomicBool::new(false);
     let worker = |number: usize| -> Result<Sums, CollectError> {
@@ -209,7 +222,6 @@ fn run_job(
     keep: Keep<'_>,
     sums: &mut Sums,
 ) -> Result<(), CollectError> {
-    make_folder(&settings.out.join(&job.task))?;
     let process = SimulatorProcess::start(&Launch {
         task: job.task.clone(),
         instance: instance.to_owned(),
@@ -256,22 +268,22 @@ pub fn record(
         let Some(Recorded { number, task, episode }) = recorded else { break };
         let folder = out.join(task_name(task));
         make_folder(&folder)?;
-        episode.write(&free_name(&folder, instance, number))?;
+        write_numbered(&episode, &folder.join(format!("{instance}-{number:05}.npz")))?;
         sums.entry((task_name(task).to_owned(), instance.to_owned())).or_default().add(&episode);
         seen(Seen::Episode);
     }
     Ok(sums)
 }
 
-/// A name that is not taken: numbers begin anew with every simulator.
-fn free_name(folder: &Path, instance: &str, number: u64) -> PathBuf {
-    (0_u32..)
-        .map(|again| {
-            let suffix = if again == 0 { String::new() } else { format!("-{again}") };
-            folder.join(format!("{instance}-{number:05}{suffix}.npz"))
-        })
-        .find(|path| !path.exists())
-        .unwrap_or_else(|| folder.join(format!("{instance}-{number:05}.npz")))
+/// Writes under a name that is not taken: numbers begin anew with every simulator. Others may write there at the same time.
+fn write_numbered(episode: &Episode, path: &Path) -> Result<(), EpisodeError> {
+    loop {
+        let free = free_name(path, |name| !name.exists());
+        match episode.write_new(&free) {
+            Err(EpisodeError::File(FileError::Exists { .. })) => {}
+            other => return other,
+        }
+    }
 }
 
 fn make_folder(path: &Path) -> Result<(), CollectError> {

@@ -148,7 +148,7 @@ impl Launch {
     }
 }
 
-/// Decisions of a whole episode: 500 environment steps with action repeat 2 (spec, section 4).
+/// Decisions of a whole episode: 500 environment steps with action repeat 2.
 pub(crate) const STEPS_PER_EPISODE: u32 = 250;
 const _: () = assert!((STEPS_PER_EPISODE as usize) < STEPS_MAX);
 

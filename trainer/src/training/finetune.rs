@@ -260,7 +260,8 @@ impl Finetuning {
     ) -> Result<(), TrainingError> {
         let going_on: Vec<_> = gathered.iter().filter(|one| !one.is_last()).collect();
         let seen: Vec<_> = going_on.iter().map(|one| one.seen()).collect();
-        let mut sampler = Sampler::numbered(self.settings.seed ^ ACTING_STREAM, self.state.policy_steps);
+        let number = noise_number(self.state.policy_steps, gathered.iter().all(Gathered::is_first));
+        let mut sampler = Sampler::numbered(self.settings.seed ^ ACTING_STREAM, number);
         let decisions = policy.decide(&seen, &mut sampler)?;
         for (one, decision) in going_on.into_iter().zip(&decisions) {
             fleet.answer(one, decision.action)?;
@@ -454,6 +455,12 @@ impl Finetuning {
     }
 }
 
+/// Which noise a decision takes after so many steps. The first decisions of episodes are no steps yet: with steps alone the second
+/// ones would take the same noise.
+fn noise_number(policy_steps: u64, all_first: bool) -> u64 {
+    2 * policy_steps + u64::from(!all_first)
+}
+
 /// Name of the stage in which the policy acts.
 const ONLINE: &str = "online";
 
@@ -473,4 +480,21 @@ fn check_finite(parameters: &Parameters) -> Result<(), TrainingError> {
         }
     }
     Ok(())
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn no_two_decisions_take_the_same_noise() {
+        let (mut steps, mut numbers) = (0, std::collections::BTreeSet::new());
+        for _episode in 0..3 {
+            for tick in 0..5 {
+                assert!(numbers.insert(noise_number(steps, tick == 0)), "tick {tick} after {steps} steps");
+                // Two simulators; what leads to an episode's first observation is no step.
+                steps += if tick == 0 { 0 } else { 2 };
+            }
+        }
+    }
 }

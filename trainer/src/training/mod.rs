@@ -82,6 +82,7 @@ use crate::replay::{LoadError, PrefetchError, ReplayError};
 use crate::simulators::CollectError;
 use rcwm_models::episode::EpisodeError;
 use rcwm_models::files::FileError;
+use rcwm_models::lock::LockError;
 use rcwm_models::settings::SettingsError;
 use std::path::PathBuf;
 
@@ -113,6 +114,17 @@ pub enum TrainingError {
         /// What is missing.
         file: &'static str,
     },
+    /// The folder is one of a run's checkpoints.
+    #[error("{path} is a checkpoint of a run; name the run's folder: {run}")]
+    InsideARun {
+        /// The folder.
+        path: PathBuf,
+        /// The run's.
+        run: PathBuf,
+    },
+    /// Somebody else writes there.
+    #[error(transparent)]
+    Lock(#[from] LockError),
     /// The folder holds a run of another kind.
     #[error("{path} holds a run of {found}; resume it with `rcwm-trainer {found} --resume`")]
     OtherPhase {

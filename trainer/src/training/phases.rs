@@ -36,7 +36,7 @@ impl Phase {
     }
 }
 
-/// Learning a new task from demonstrations alone (spec: phases 6): first the environment's side, then the whole world model, then the
+/// Learning a new task from demonstrations alone: first the environment's side, then the whole world model, then the
 /// actor. The vanilla baseline has no environment's side: both of its first stages train all of it.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields, default)]
@@ -150,7 +150,7 @@ impl FewshotSettings {
     }
 }
 
-/// Acting and learning on one task (spec: phases 4 and 5). A **step** is one decision of the policy: with the action repeat of 2 it is
+/// Acting and learning on one task. A **step** is one decision of the policy: with the action repeat of 2 it is
 /// two steps of the environment as the paper's figures count them.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields, default)]

@@ -19,7 +19,7 @@ const WORLD: &str = "world";
 /// What sets the replay's stream of draws apart from the sampler's under the same seed.
 const REPLAY_STREAM: u64 = 0x7265_706c_6179;
 
-/// Pre-training of the world model (spec: phases 2): masked warm-up, then mask-free updates.
+/// Pre-training of the world model: masked warm-up, then mask-free updates.
 #[derive(Debug)]
 pub struct Pretraining {
     settings: TrainingSettings,

@@ -7,7 +7,7 @@ use crate::learning::{Side, side_of};
 use crate::model::agent;
 use crate::model::parameters::{ParameterError, ParameterSpec, Parameters};
 
-/// What of a pre-trained world model starts anew on a new task (spec: phases 3).
+/// What of a pre-trained world model starts anew on a new task.
 ///
 /// | name | drawn anew |
 /// | --- | --- |

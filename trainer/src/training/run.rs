@@ -4,6 +4,7 @@ use std::path::{Path, PathBuf};
 
 use candle_core::Device;
 use rcwm_models::files::{read_capped, write_atomic};
+use rcwm_models::lock::Lock;
 use rcwm_models::tensors::Tensors;
 use rustix::time::{ClockId, clock_gettime};
 use serde::{Deserialize, Serialize};
@@ -32,6 +33,8 @@ pub struct Run {
     cpu: CpuTime,
     average_decay: f64,
     average: Option<WeightAverage>,
+    /// Nobody else writes here.
+    _lock: Lock,
 }
 
 /// Processor time of all threads that a run has taken.
@@ -107,8 +110,13 @@ impl Run {
             return Err(TrainingError::Exists { path: folder.to_path_buf() });
         }
         fs::create_dir_all(folder).map_err(failed(folder))?;
+        let lock = Lock::take(folder)?;
+        // Another one may have begun it between the two lines above, and ended.
+        if folder.join(SETTINGS_FILE).exists() {
+            return Err(TrainingError::Exists { path: folder.to_path_buf() });
+        }
         write_atomic(&folder.join(METRICS_FILE), b"")?;
-        Self::open(folder, settings, 0)
+        Self::open(folder, settings, 0, lock)
     }
 
     /// Goes on with the run in `folder`, which must be of one of these phases and of this model.
@@ -126,14 +134,15 @@ impl Run {
             let found = settings.phase.verb();
             return Err(TrainingError::OtherPhase { path: folder.to_path_buf(), found });
         }
+        let lock = Lock::take(folder)?;
         if !Self::has_checkpoint(folder) {
-            return Ok(GoesOn::FromStart(Self::resume(folder, settings, 0)?));
+            return Ok(GoesOn::FromStart(Self::resume(folder, settings, 0, lock)?));
         }
         let (Checkpoint { settings: stored, parameters }, state, moments) = Self::load(folder, device)?;
         if stored.model != settings.model {
             return Err(TrainingError::OtherModel);
         }
-        let mut run = Self::resume(folder, settings, state.updates)?;
+        let mut run = Self::resume(folder, settings, state.updates, lock)?;
         run.cpu.earlier = stored.cpu_seconds;
         let trained = TrainingState::trained(&agent::specs(&stored.model)?, &moments, device)?;
         let parameters = match trained {
@@ -151,7 +160,12 @@ impl Run {
     ///
     /// # Errors
     /// Those of reading and writing.
-    fn resume(folder: &Path, settings: &TrainingSettings, updates: u64) -> Result<Self, TrainingError> {
+    fn resume(
+        folder: &Path,
+        settings: &TrainingSettings,
+        updates: u64,
+        lock: Lock,
+    ) -> Result<Self, TrainingError> {
         #[derive(Deserialize)]
         struct Line {
             update: u64,
@@ -170,11 +184,16 @@ impl Run {
             remove_unfinished(&place).map_err(failed(&place))?;
         }
         write_atomic(&path, kept.as_bytes())?;
-        Self::open(folder, settings, updates + 1)
+        Self::open(folder, settings, updates + 1, lock)
     }
 
     /// `first_update` is the one that this process makes first where it goes on, else 0.
-    fn open(folder: &Path, settings: &TrainingSettings, first_update: u64) -> Result<Self, TrainingError> {
+    fn open(
+        folder: &Path,
+        settings: &TrainingSettings,
+        first_update: u64,
+        lock: Lock,
+    ) -> Result<Self, TrainingError> {
         write_atomic(&folder.join(SETTINGS_FILE), toml::to_string(settings)?.as_bytes())?;
         let path = folder.join(METRICS_FILE);
         let metrics = OpenOptions::new().append(true).open(&path).map_err(failed(&path))?;
@@ -186,6 +205,7 @@ impl Run {
             cpu: CpuTime::since_now(0.0),
             average_decay: settings.average_decay,
             average: None,
+            _lock: lock,
         })
     }
 
@@ -196,6 +216,11 @@ impl Run {
     pub fn settings(folder: &Path) -> Result<TrainingSettings, TrainingError> {
         let path = folder.join(SETTINGS_FILE);
         if !path.exists() {
+            let around = folder.ancestors().skip(1).take(2).find(|run| run.join(SETTINGS_FILE).exists());
+            if let (Some(run), true) = (around, folder.join(checkpoint::SETTINGS_FILE).exists()) {
+                let (path, run) = (folder.to_path_buf(), run.to_path_buf());
+                return Err(TrainingError::InsideARun { path, run });
+            }
             return Err(TrainingError::NothingToResume { path: folder.to_path_buf(), file: SETTINGS_FILE });
         }
         Ok(rcwm_models::settings::read(&path)?)

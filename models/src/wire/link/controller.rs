@@ -6,7 +6,7 @@ use std::time::Duration;
 use iceoryx2::prelude::Node;
 
 use super::direction::{Direction, EVENT_CLOSED, EVENT_HELLO, EVENT_PUBLISHED, Received, Receiver, Sender};
-use super::domain::make_node;
+use super::domain::join;
 use super::error::traffic;
 use super::{Ipc, LinkError, LinkSettings, Wait};
 use crate::wire::clock::monotonic_ns;
@@ -33,12 +33,13 @@ impl ControllerLink {
     /// # Errors
     /// See [`LinkError`]; a second controller gets [`LinkError::Taken`].
     pub fn open(settings: LinkSettings) -> Result<Self, LinkError> {
-        let node = make_node(&settings)?;
-        let observation = Direction::<Observation>::open(&node, &settings.instance, "observation")?;
-        let action = Direction::<Action>::open(&node, &settings.instance, "action")?;
-        let observations = observation.receiver()?;
-        let actions = action.sender("controller")?;
-        let link = Self { settings, observations, actions, said_closed: Cell::new(false), node };
+        let link = join(&settings.clone(), size_of::<Action>(), |node| {
+            let observation = Direction::<Observation>::open(&node, &settings.instance, "observation")?;
+            let action = Direction::<Action>::open(&node, &settings.instance, "action")?;
+            let observations = observation.receiver()?;
+            let actions = action.sender("controller")?;
+            Ok(Self { settings, observations, actions, said_closed: Cell::new(false), node })
+        })?;
         link.hello()?;
         Ok(link)
     }

@@ -3,7 +3,30 @@
 use iceoryx2::node::NodeCreationFailure;
 use iceoryx2::prelude::*;
 
-use super::{Ipc, LinkError, LinkSettings};
+use std::path::Path;
+
+use super::{Ipc, LinkError, LinkSettings, memory};
+
+/// Joins the domain as a node of its own and opens a link there, whose sender's messages are of so many bytes.
+pub(super) fn join<T>(
+    settings: &LinkSettings,
+    message_bytes: usize,
+    open: impl FnOnce(Node<Ipc>) -> Result<T, LinkError>,
+) -> Result<T, LinkError> {
+    let config = config(settings.prefix.as_deref())?;
+    let (prefix, root) = (config.global.prefix.to_string(), config.global.root_path().to_string());
+    memory::check_room(message_bytes)?;
+    memory::open_folders(Path::new(&root));
+    let before = memory::files(&prefix);
+    let link = make_node(settings).and_then(open).map_err(|error| match error {
+        LinkError::Node(_) | LinkError::Service { .. } => {
+            memory::other_user(Path::new(&root), &prefix).unwrap_or(error)
+        }
+        other => other,
+    })?;
+    memory::reserve(&prefix, &before)?;
+    Ok(link)
+}
 
 /// Joins the domain as a node of its own.
 pub(super) fn make_node(settings: &LinkSettings) -> Result<Node<Ipc>, LinkError> {

@@ -1,5 +1,7 @@
 //! Why a link fails.
 
+use std::path::PathBuf;
+
 /// Why a link could not be made or used.
 #[derive(Debug, thiserror::Error)]
 pub enum LinkError {
@@ -12,6 +14,43 @@ pub enum LinkError {
     /// Shared memory is not usable.
     #[error("shared memory: {0}; check that /dev/shm and /tmp/iceoryx2 can be written by this user")]
     Node(String),
+    /// There is no room for the link's messages.
+    #[error(
+        "shared memory is full: /dev/shm has {free_kib} KiB free, the link needs {needed_kib}; remove what fills it, or give the \
+         container more (docker run --shm-size=256m; Kubernetes: an emptyDir with medium Memory at /dev/shm)"
+    )]
+    Memory {
+        /// What is free, in KiB.
+        free_kib: u64,
+        /// What is needed, in KiB.
+        needed_kib: u64,
+    },
+    /// A folder of iceoryx2's keeps this user out.
+    #[error(
+        "shared memory: {path} belongs to user {owner}, and this user may not write there; run all programs as one user, or let \
+         user {owner} (or root) open it: chmod 1777 {root} {root}/services {root}/nodes"
+    )]
+    FolderOfOtherUser {
+        /// The folder.
+        path: PathBuf,
+        /// Number of its owner.
+        owner: u32,
+        /// The folder of all that iceoryx2 shares beside memory.
+        root: PathBuf,
+    },
+    /// The link's files are another user's.
+    #[error(
+        "shared memory: {path} belongs to user {owner}; run all programs of a link as one user, or give this user's a prefix of \
+         their own: RCWM_PREFIX=name (now {prefix:?})"
+    )]
+    FilesOfOtherUser {
+        /// The first of them.
+        path: PathBuf,
+        /// Number of its owner.
+        owner: u32,
+        /// The prefix that both use.
+        prefix: String,
+    },
     /// A peer of another version owns the service.
     #[error(
         "{service}: the peer speaks another version of the message (this program speaks {expected}); \

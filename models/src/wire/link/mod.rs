@@ -8,6 +8,7 @@ mod controller;
 mod direction;
 mod domain;
 mod error;
+mod memory;
 mod observer;
 mod simulator;
 
@@ -16,6 +17,7 @@ use std::time::Duration;
 pub use controller::{ControllerLink, ObservationSample};
 pub use domain::{forget_prefix, list_leftovers};
 pub use error::LinkError;
+pub use memory::shared_memory_number;
 pub use observer::{ActionObserverLink, ObserverLink};
 pub use simulator::{ObservationSlot, SimulatorLink};
 

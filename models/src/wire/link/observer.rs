@@ -5,7 +5,7 @@ use std::time::Duration;
 use iceoryx2::prelude::Node;
 
 use super::direction::{Direction, Received, Receiver};
-use super::domain::make_node;
+use super::domain::join;
 use super::{Ipc, LinkError, LinkSettings, Wait};
 use crate::wire::{Action, Observation};
 
@@ -23,10 +23,11 @@ impl ObserverLink {
     /// # Errors
     /// See [`LinkError`].
     pub fn open(settings: LinkSettings) -> Result<Self, LinkError> {
-        let node = make_node(&settings)?;
-        let observations =
-            Direction::<Observation>::open(&node, &settings.instance, "observation")?.receiver()?;
-        Ok(Self { settings, observations, _node: node })
+        join(&settings.clone(), 0, |node| {
+            let observations =
+                Direction::<Observation>::open(&node, &settings.instance, "observation")?.receiver()?;
+            Ok(Self { settings, observations, _node: node })
+        })
     }
 
     /// Waits for the next observation; [`Wait::Closed`] when the simulator has said that none will come.
@@ -51,9 +52,10 @@ impl ActionObserverLink {
     /// # Errors
     /// See [`LinkError`].
     pub fn open(settings: &LinkSettings) -> Result<Self, LinkError> {
-        let node = make_node(settings)?;
-        let actions = Direction::<Action>::open(&node, &settings.instance, "action")?.receiver()?;
-        Ok(Self { actions, _node: node })
+        join(settings, 0, |node| {
+            let actions = Direction::<Action>::open(&node, &settings.instance, "action")?.receiver()?;
+            Ok(Self { actions, _node: node })
+        })
     }
 
     /// The newest action, if one is waiting; never blocks.

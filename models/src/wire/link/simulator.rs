@@ -5,7 +5,7 @@ use std::time::Duration;
 use iceoryx2::prelude::Node;
 
 use super::direction::{Direction, EVENT_CLOSED, EVENT_PUBLISHED, Receiver, Sender};
-use super::domain::make_node;
+use super::domain::join;
 use super::error::traffic;
 use super::{Events, Ipc, LinkError, LinkSettings, Wait};
 use crate::wire::clock::monotonic_ns;
@@ -44,12 +44,13 @@ impl SimulatorLink {
     /// # Errors
     /// See [`LinkError`]; a second simulator gets [`LinkError::Taken`].
     pub fn open(settings: LinkSettings) -> Result<Self, LinkError> {
-        let node = make_node(&settings)?;
-        let observation = Direction::<Observation>::open(&node, &settings.instance, "observation")?;
-        let action = Direction::<Action>::open(&node, &settings.instance, "action")?;
-        let actions = action.receiver()?;
-        let observations = observation.sender("simulator")?;
-        Ok(Self { settings, observations, actions, node })
+        join(&settings.clone(), size_of::<Observation>(), |node| {
+            let observation = Direction::<Observation>::open(&node, &settings.instance, "observation")?;
+            let action = Direction::<Action>::open(&node, &settings.instance, "action")?;
+            let actions = action.receiver()?;
+            let observations = observation.sender("simulator")?;
+            Ok(Self { settings, observations, actions, node })
+        })
     }
 
     /// Publishes one observation and wakes the controller. `published_ns` is set here.

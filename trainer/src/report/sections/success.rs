@@ -14,7 +14,7 @@ const COLUMNS: [Column<'_>; 7] = [
     Column::Number("tick p50 / p99, ms"),
 ];
 
-/// Every task of the spec with its policies.
+/// Every task of the paper with its policies.
 pub(super) fn section(report: &Report) -> Result<Markup, ReportError> {
     let parts: Vec<_> = report.success.iter().filter(|part| part.source.disturb == UNDISTURBED).collect();
     let others = parts.iter().map(|part| part.source.task.as_str());

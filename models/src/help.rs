@@ -1,0 +1,56 @@
+//! The examples of a help text, as what a shell would make of them: tests hold every one of them against the command line and the
+//! files that there are.
+
+/// The examples of `program` in a help text, each as its words; a line that ends in a backslash goes on in the next one. What stands
+/// behind two spaces and a bracket is a remark.
+#[must_use]
+pub fn examples(text: &str, program: &str) -> Vec<Vec<String>> {
+    let joined = text.replace("\\\n", " ");
+    let commands = joined.lines().map(str::trim).filter(|line| line.split(' ').next() == Some(program));
+    commands.map(|line| words(line.split("  (").next().unwrap_or(line))).collect()
+}
+
+/// Words as a shell splits them: by spaces outside of double quotes; a `&` at the end is none.
+fn words(line: &str) -> Vec<String> {
+    let (mut words, mut word, mut quoted) = (Vec::new(), String::new(), false);
+    for letter in line.chars() {
+        match letter {
+            '"' => quoted = !quoted,
+            ' ' if !quoted => words.push(std::mem::take(&mut word)),
+            letter => word.push(letter),
+        }
+    }
+    words.push(word);
+    words.retain(|word| !word.is_empty() && word != "&");
+    words
+}
+
+/// The first path of an example that is said to be shipped, under `models/` or `tests/`, and is not there below `root`.
+#[must_use]
+pub fn missing_file(example: &[String], root: &std::path::Path) -> Option<String> {
+    let shipped = |word: &&String| word.starts_with("models/") || word.starts_with("tests/");
+    let made = |index: usize| index > 0 && example[index - 1] == "--out";
+    let paths = example.iter().enumerate().filter(|(index, word)| shipped(word) && !made(*index));
+    paths.map(|(_, word)| word).find(|word| !root.join(word).exists()).cloned()
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn examples_are_what_a_shell_would_run() {
+        let text = "Examples:\n  tool go --a 1 \\\n      --b \"x y=z\" &\n  other go\n  tool stop        (when it is enough)\n\nMore.";
+        let expected = [vec!["tool", "go", "--a", "1", "--b", "x y=z"], vec!["tool", "stop"]];
+        assert_eq!(examples(text, "tool"), expected);
+    }
+
+    #[test]
+    fn a_path_that_is_said_to_be_shipped_must_be_there() {
+        let folder = tempfile::tempdir().unwrap();
+        std::fs::create_dir(folder.path().join("models")).unwrap();
+        let missing = |line: &str| missing_file(&words(line), folder.path());
+        assert_eq!(missing("tool --bundle models/debug"), Some("models/debug".to_owned()));
+        assert_eq!(missing("tool --bundle runs/mine --out models/new models/"), None);
+    }
+}
