@@ -334,7 +334,7 @@ impl Draft {
         message.episode = counts.episode.wrapping_add(self.episode_off);
         message.step = self.step.unwrap_or(counts.step);
         counts.step = counts.step.wrapping_add(1);
-        message.flags = self.flags ^ u32::from(self.begins) * ObservationFlags::FIRST.0;
+        message.flags = self.flags ^ (u32::from(self.begins) * ObservationFlags::FIRST.0);
         message.period_ns = self.period_ns;
         message.published_ns = self.clock.shows(now_ns);
         message.scheduled_ns = if self.schedule_too { message.published_ns } else { now_ns };

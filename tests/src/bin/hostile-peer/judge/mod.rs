@@ -321,7 +321,7 @@ impl Judge {
     fn check_rate(&mut self, action: &Action) {
         let Some(rate_max) = self.setup.rate_max else { return };
         let near = |base: &Vector, limits: &ActionLimits| {
-            let base = base.map(|x| f64::from(x));
+            let base = base.map(f64::from);
             (0..ACTION_LEN).all(|i| {
                 let (low, high) = (f64::from(limits.low[i]), f64::from(limits.high[i]));
                 let slack = 1e-6 * (1.0 + base[i].abs());
