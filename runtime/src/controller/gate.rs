@@ -134,11 +134,17 @@ impl Gate {
 
     fn limit_rate(&self, action: [f32; ACTION_LEN]) -> [f32; ACTION_LEN] {
         let (Some(rate_max), Some(held)) = (self.rate_max, self.held()) else { return action };
-        let near = |action: [f32; ACTION_LEN], to: [f32; ACTION_LEN]| {
-            std::array::from_fn(|i| action[i].clamp(to[i] - rate_max, to[i] + rate_max))
-        };
         // What was sent last may be executed only after the observation that is answered now: near it too, where that is possible.
-        near(self.sent.map_or(action, |sent| near(action, sent)), held)
+        let sent = self.sent.unwrap_or(held);
+        std::array::from_fn(|i| {
+            let (low, high) = (held[i] - rate_max, held[i] + rate_max);
+            let (low_of_both, high_of_both) = (low.max(sent[i] - rate_max), high.min(sent[i] + rate_max));
+            if low_of_both <= high_of_both {
+                action[i].clamp(low_of_both, high_of_both)
+            } else {
+                action[i].clamp(low, high)
+            }
+        })
     }
 
     /// The action was sent.
