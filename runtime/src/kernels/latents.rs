@@ -42,13 +42,12 @@ impl WithSimd for LogProbs<'_> {
     }
 }
 
-/// The largest number; forgets NaN, which the sum of exponentials does not.
+/// The largest number; may forget NaN, which the sum of exponentials does not.
 #[inline(always)]
 fn largest<S: Simd>(simd: S, row: &[f32]) -> f32 {
     let (whole, rest) = S::as_simd_f32s(row);
     let mut lanes = simd.splat_f32s(f32::NEG_INFINITY);
     for x in whole {
-        // The second operand wins where one is NaN.
         lanes = simd.max_f32s(*x, lanes);
     }
     rest.iter().copied().fold(simd.reduce_max_f32s(lanes), f32::max)

@@ -12,11 +12,12 @@ const EXP: [f32; 8] = [1.0 / 5_040.0, 1.0 / 720.0, 1.0 / 120.0, 1.0 / 24.0, 1.0 
 /// Coefficients of `2 atanh(s) / s` in s^2, highest first.
 const ATANH: [f32; 6] = [2.0 / 11.0, 2.0 / 9.0, 2.0 / 7.0, 2.0 / 5.0, 2.0 / 3.0, 2.0];
 
-/// `e^x`; x is held within -87 and 88. NaN stays NaN.
+/// `e^x`; a finite x is held within -87 and 88. What is not finite gives NaN.
 #[inline(always)]
 pub(super) fn exp<S: Simd>(simd: S, x: S::f32s) -> S::f32s {
     let splat = |value: f32| simd.splat_f32s(value);
-    // The second operand wins where one is NaN.
+    // 0, or NaN where x is not finite: which operand of minimum and maximum wins there differs from processor to processor.
+    let poison = simd.sub_f32s(x, x);
     let x = simd.min_f32s(splat(88.0), simd.max_f32s(splat(-87.0), x));
     let shifted = simd.mul_add_f32s(x, splat(std::f32::consts::LOG2_E), splat(ROUND));
     let n = simd.sub_f32s(shifted, splat(ROUND));
@@ -27,7 +28,7 @@ pub(super) fn exp<S: Simd>(simd: S, x: S::f32s) -> S::f32s {
         p = simd.mul_add_f32s(r, p, splat(*term));
     }
     let power = simd.wrapping_dyn_shl_u32s(simd.transmute_u32s_f32s(shifted), simd.splat_u32s(23));
-    simd.transmute_f32s_u32s(simd.add_u32s(simd.transmute_u32s_f32s(p), power))
+    simd.add_f32s(simd.transmute_f32s_u32s(simd.add_u32s(simd.transmute_u32s_f32s(p), power)), poison)
 }
 
 /// `1 / (1 + e^-x)`.

@@ -14,6 +14,8 @@
 pub mod conv;
 pub mod latents;
 mod math;
+#[cfg(test)]
+mod not_finite;
 pub mod matrix;
 pub mod norm;
 pub mod table;
