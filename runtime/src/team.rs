@@ -1,81 +1,44 @@
 //! A second thread for the tick.
 //!
-//! The calling thread publishes a piece of work as numbered chunks and begins to claim them; the helper, where it is awake, claims from the
-//! other end of the same counter. A chunk is run by whoever claimed it, so that a helper that sleeps or was preempted before it claimed
-//! anything costs nothing: the caller does all of it. Between ticks the helper spins for a while, then sleeps.
-//!
-//! An errand is what only the helper does, on what belongs to it: its caller need not wait for it.
+//! The calling thread sends the helper with a job and goes on with its own share. Everything that the helper touches belongs to the job, so that
+//! nobody has to wait for it: whoever has waited long enough does the helper's share as well, and what the helper brings later is
+//! dropped. Between jobs the helper spins for a while, then sleeps.
 
-use std::sync::atomic::{AtomicBool, AtomicU64, AtomicUsize, Ordering};
-use std::sync::{Arc, OnceLock};
+use std::sync::atomic::{AtomicBool, AtomicU64, Ordering};
+use std::sync::{Arc, Mutex, MutexGuard, PoisonError, TryLockError};
 use std::thread::{JoinHandle, Thread};
 use std::time::{Duration, Instant};
 
 /// Name of the helper's thread, as the system shows it.
 pub const HELPER_NAME: &str = "rcwm-tick";
-/// Most chunks of a piece of work.
-const CHUNKS_MAX: usize = 0xffff;
-/// Bits of the ticket that hold the next chunk, and the number of chunks.
-const BITS: u32 = 16;
 /// Spins between two looks at the clock.
 const SPINS: u32 = 64;
+/// The helper is late when it was waited for at least so long: two cores are seldom equally fast.
+pub const PATIENCE_MIN: Duration = Duration::from_micros(15);
 
-type Work<'a> = &'a (dyn Fn(usize) + Sync);
-type Errand = Box<dyn Fn() + Send + Sync>;
+/// What the helper can be sent to do.
+pub trait Job: Send + Sync {
+    /// Does it. May come late, or once more: a job knows itself whether there is still something to do.
+    fn help(&self);
+}
 
 /// What both threads share.
 #[derive(Default)]
 struct Shared {
-    /// Generation (32 bits), number of chunks (16), next chunk (16), in one word: claiming a chunk of old work cannot succeed.
-    ticket: AtomicU64,
-    /// Address and table of the work; valid while a claimed chunk of its generation is not done.
-    work: [AtomicUsize; 2],
-    done: AtomicUsize,
-    panicked: AtomicBool,
-    errand: OnceLock<Errand>,
-    errand_wanted: AtomicBool,
+    job: Mutex<Option<Arc<dyn Job>>>,
+    wanted: AtomicBool,
+    late: AtomicBool,
     asleep: AtomicBool,
     ends: AtomicBool,
 }
 
 impl Shared {
-    fn claim(&self) -> Option<usize> {
-        let mut ticket = self.ticket.load(Ordering::Acquire);
-        loop {
-            let (next, chunks) = (ticket & 0xffff, (ticket >> BITS) & 0xffff);
-            if next >= chunks {
-                return None;
-            }
-            match self.ticket.compare_exchange_weak(ticket, ticket + 1, Ordering::AcqRel, Ordering::Acquire) {
-                Ok(_) => return Some(next as usize),
-                Err(now) => ticket = now,
-            }
-        }
-    }
-
-    /// Runs a claimed chunk.
-    fn run(&self, chunk: usize) {
-        let work = self.work.each_ref().map(|part| part.load(Ordering::Acquire));
-        // SAFETY: the two words are those of a `Work` that `Team::each` stored before it published the ticket this chunk was
-        // claimed from, and `Team::each` does not return before all claimed chunks are done.
-        let work: Work<'_> = unsafe { std::mem::transmute::<[usize; 2], Work<'_>>(work) };
-        if std::panic::catch_unwind(std::panic::AssertUnwindSafe(|| work(chunk))).is_err() {
-            self.panicked.store(true, Ordering::Release);
-        }
-        self.done.fetch_add(1, Ordering::Release);
-    }
-
     /// The helper's life.
     fn help(&self, spin: Duration) {
         let mut idle_since = Instant::now();
         while !self.ends.load(Ordering::Acquire) {
-            if let Some(chunk) = self.claim() {
-                self.run(chunk);
-                idle_since = Instant::now();
-                continue;
-            }
-            if self.take_errand() {
-                self.run_errand();
+            if self.take() {
+                self.run();
                 idle_since = Instant::now();
                 continue;
             }
@@ -89,32 +52,30 @@ impl Shared {
         }
     }
 
-    /// Whether there is an errand; whoever is told so has it.
-    fn take_errand(&self) -> bool {
-        self.errand_wanted.load(Ordering::Relaxed) && self.errand_wanted.swap(false, Ordering::AcqRel)
+    /// Whether there is a job; whoever is told so has it.
+    fn take(&self) -> bool {
+        self.wanted.load(Ordering::Relaxed) && self.wanted.swap(false, Ordering::AcqRel)
     }
 
-    fn run_errand(&self) {
-        if let Some(errand) = self.errand.get() {
+    fn run(&self) {
+        let job = self.job.lock().unwrap_or_else(PoisonError::into_inner).take();
+        if let Some(job) = job {
             // Whoever waits for it sees that it has brought nothing, and does it without the helper.
-            let _ = std::panic::catch_unwind(std::panic::AssertUnwindSafe(errand));
+            let _ = std::panic::catch_unwind(std::panic::AssertUnwindSafe(|| job.help()));
         }
     }
 
     fn sleep(&self) {
         self.asleep.store(true, Ordering::SeqCst);
-        // Work that was published in between is seen here, or its publisher sees `asleep`.
-        let ticket = self.ticket.load(Ordering::SeqCst);
-        let nothing =
-            ticket & 0xffff >= (ticket >> BITS) & 0xffff && !self.errand_wanted.load(Ordering::SeqCst);
-        if nothing && !self.ends.load(Ordering::SeqCst) {
+        // A job that was sent in between is seen here, or its sender sees `asleep`.
+        if !self.wanted.load(Ordering::SeqCst) && !self.ends.load(Ordering::SeqCst) {
             std::thread::park();
         }
         self.asleep.store(false, Ordering::SeqCst);
     }
 }
 
-/// The calling thread and its helper.
+/// The calling thread's end, and its helper. One thread at a time sends jobs.
 pub struct Team {
     shared: Arc<Shared>,
     helper: Option<JoinHandle<()>>,
@@ -128,7 +89,7 @@ impl std::fmt::Debug for Team {
 }
 
 impl Team {
-    /// Starts the helper; it spins this long after work before it sleeps.
+    /// Starts the helper; it spins this long after a job before it sleeps.
     ///
     /// # Errors
     /// What the operating system says.
@@ -142,56 +103,37 @@ impl Team {
         Ok(Self { shared, helper: Some(helper), thread })
     }
 
-    /// Wakes the helper, so that it is there when work comes.
+    /// Wakes the helper, so that it is there when a job comes.
     pub fn wake(&self) {
         if self.shared.asleep.load(Ordering::SeqCst) {
             self.thread.unpark();
         }
     }
 
-    /// What [`Self::send`] sends the helper to do; a second errand is refused.
-    ///
-    /// # Errors
-    /// The errand, where there is one already.
-    pub fn set_errand(&self, errand: Errand) -> Result<(), Errand> {
-        self.shared.errand.set(errand)
+    /// Sends the helper, which begins as soon as it has nothing else to do. A job that it has not begun by then is forgotten.
+    pub fn send(&self, job: Arc<dyn Job>) {
+        // The helper holds it for a moment only; where it was stopped in that moment it will not come anyway.
+        if let Some(mut place) = try_lock(&self.shared.job) {
+            *place = Some(job);
+            drop(place);
+            self.shared.wanted.store(true, Ordering::SeqCst);
+            self.wake();
+        }
     }
 
-    /// Sends the helper on its errand, which it begins as soon as it has nothing else to do.
-    pub fn send(&self) {
-        self.shared.errand_wanted.store(true, Ordering::SeqCst);
-        self.wake();
-    }
-
-    /// Calls the errand off; whether the helper had not begun it.
+    /// Calls the job off; whether the helper had not begun it.
     pub fn call_off(&self) -> bool {
-        self.shared.take_errand()
+        self.shared.take()
     }
 
-    /// Runs `work(0)` to `work(chunks - 1)`, in any order, on both threads. Only one thread may call this at a time; `&mut` makes sure.
-    ///
-    /// # Panics
-    /// If a chunk panics, after all of them are done.
-    pub fn each(&mut self, chunks: usize, work: Work<'_>) {
-        assert!(chunks <= CHUNKS_MAX, "team: {chunks} chunks");
-        let shared = &*self.shared;
-        // SAFETY: only the lifetime is forgotten. Nobody reads the words after this function has returned: a chunk can be claimed
-        // only while the ticket is of this generation, and all of them are done before that.
-        let words = unsafe { std::mem::transmute::<Work<'_>, [usize; 2]>(work) };
-        for (place, word) in shared.work.iter().zip(words) {
-            place.store(word, Ordering::Relaxed);
-        }
-        shared.done.store(0, Ordering::Relaxed);
-        let generation = (shared.ticket.load(Ordering::Relaxed) >> (2 * BITS)).wrapping_add(1) & 0xffff_ffff;
-        shared.ticket.store(generation << (2 * BITS) | (chunks as u64) << BITS, Ordering::SeqCst);
-        self.wake();
-        while let Some(chunk) = shared.claim() {
-            shared.run(chunk);
-        }
-        while shared.done.load(Ordering::Acquire) < chunks {
-            std::hint::spin_loop();
-        }
-        assert!(!shared.panicked.swap(false, Ordering::AcqRel), "team: a chunk panicked");
+    /// Notes that the helper was not waited for.
+    pub fn note_late(&self) {
+        self.shared.late.store(true, Ordering::Relaxed);
+    }
+
+    /// Whether the helper was late since the last time this was asked.
+    pub fn take_late(&self) -> bool {
+        self.shared.late.swap(false, Ordering::Relaxed)
     }
 }
 
@@ -200,76 +142,123 @@ impl Drop for Team {
         self.shared.ends.store(true, Ordering::SeqCst);
         self.thread.unpark();
         if let Some(helper) = self.helper.take() {
-            // It has no panics of its own; those of chunks were passed on.
+            // It has no panics of its own.
             let _ = helper.join();
         }
+    }
+}
+
+/// None while somebody else is at it.
+pub fn try_lock<T>(mutex: &Mutex<T>) -> Option<MutexGuard<'_, T>> {
+    match mutex.try_lock() {
+        Ok(guard) => Some(guard),
+        Err(TryLockError::Poisoned(poisoned)) => Some(poisoned.into_inner()),
+        Err(TryLockError::WouldBlock) => None,
+    }
+}
+
+/// Numbered pieces that two threads claim from both ends until they meet.
+#[derive(Debug, Default)]
+pub struct Pieces {
+    /// The next from the front (low half), and the one behind the next from the back (high half).
+    ends: AtomicU64,
+}
+
+impl Pieces {
+    /// Lays out `count` pieces. What was claimed before is forgotten.
+    pub fn lay_out(&self, count: u32) {
+        self.ends.store(u64::from(count) << 32, Ordering::Release);
+    }
+
+    /// The next piece from the front.
+    pub fn claim_front(&self) -> Option<usize> {
+        self.claim(|front, back| (front + 1, back)).map(|(front, _)| front)
+    }
+
+    /// The next piece from the back.
+    pub fn claim_back(&self) -> Option<usize> {
+        self.claim(|front, back| (front, back - 1)).map(|(_, back)| back - 1)
+    }
+
+    /// How many were claimed from the front; once all are claimed, the first that was claimed from the back.
+    pub fn front(&self) -> usize {
+        (self.ends.load(Ordering::Acquire) & 0xffff_ffff) as usize
+    }
+
+    /// Both ends before the claim.
+    fn claim(&self, claimed: impl Fn(u64, u64) -> (u64, u64)) -> Option<(usize, usize)> {
+        let apart = |ends: u64| (ends & 0xffff_ffff, ends >> 32);
+        let before = self.ends.fetch_update(Ordering::AcqRel, Ordering::Acquire, |ends| {
+            let (front, back) = apart(ends);
+            (front < back).then(|| {
+                let (front, back) = claimed(front, back);
+                back << 32 | front
+            })
+        });
+        before.ok().map(apart).map(|(front, back)| (front as usize, back as usize))
     }
 }
 
 #[cfg(test)]
 mod tests {
     use super::*;
+    use std::sync::atomic::AtomicUsize;
 
-    #[test]
-    fn every_chunk_runs_once_whether_the_helper_sleeps_or_not() {
-        for spin in [Duration::ZERO, Duration::from_millis(50)] {
-            let mut team = Team::start(spin).unwrap();
-            for round in 0..2000_usize {
-                let chunks = round % 9;
-                let runs: Vec<AtomicUsize> = (0..chunks).map(|_| AtomicUsize::new(0)).collect();
-                team.each(chunks, &|chunk| {
-                    runs[chunk].fetch_add(1, Ordering::Relaxed);
-                });
-                assert!(runs.iter().all(|runs| runs.load(Ordering::Relaxed) == 1), "{round}: {runs:?}");
-            }
+    #[derive(Default)]
+    struct Counting(AtomicUsize);
+
+    impl Job for Counting {
+        fn help(&self) {
+            self.0.fetch_add(1, Ordering::SeqCst);
         }
     }
 
     #[test]
-    fn an_errand_is_run_once_or_called_off() {
+    fn a_job_is_run_once_or_called_off() {
         for spin in [Duration::ZERO, Duration::from_millis(50)] {
-            let mut team = Team::start(spin).unwrap();
-            let runs = Arc::new(AtomicUsize::new(0));
-            let errand = Arc::clone(&runs);
-            let set = team.set_errand(Box::new(move || {
-                errand.fetch_add(1, Ordering::SeqCst);
-            }));
-            assert!(set.is_ok() && team.set_errand(Box::new(|| {})).is_err());
+            let team = Team::start(spin).unwrap();
+            let job = Arc::new(Counting::default());
             for round in 1..2000_usize {
-                let before = runs.load(Ordering::SeqCst);
-                team.send();
-                if round % 3 == 0 {
-                    team.each(2, &|_| {});
-                }
+                let before = job.0.load(Ordering::SeqCst);
+                team.send(Arc::clone(&job) as Arc<dyn Job>);
                 let called_off = round % 2 == 0 && team.call_off();
-                while !called_off && runs.load(Ordering::SeqCst) == before {
+                while !called_off && job.0.load(Ordering::SeqCst) == before {
                     std::hint::spin_loop();
                 }
-                assert_eq!(runs.load(Ordering::SeqCst), before + usize::from(!called_off), "{round}");
+                assert_eq!(job.0.load(Ordering::SeqCst), before + usize::from(!called_off), "{round}");
             }
         }
     }
 
     #[test]
-    fn both_threads_work() {
-        let mut team = Team::start(Duration::from_secs(1)).unwrap();
-        let names = std::sync::Mutex::new(std::collections::BTreeSet::new());
-        for _ in 0..200 {
-            team.each(2, &|_| {
-                std::thread::sleep(Duration::from_millis(1));
-                names.lock().unwrap().insert(std::thread::current().name().map(String::from));
-            });
-        }
-        assert_eq!(names.lock().unwrap().len(), 2);
+    fn every_piece_is_claimed_once_from_one_of_the_ends() {
+        const COUNT: u32 = 100_000;
+        let pieces = Pieces::default();
+        pieces.lay_out(COUNT);
+        let (front, back) = std::thread::scope(|scope| {
+            let back = scope.spawn(|| std::iter::from_fn(|| pieces.claim_back()).collect::<Vec<_>>());
+            let front: Vec<_> = std::iter::from_fn(|| pieces.claim_front()).collect();
+            (front, back.join().unwrap())
+        });
+        assert_eq!(pieces.front(), front.len());
+        let all: Vec<_> = front.into_iter().chain(back.into_iter().rev()).collect();
+        assert!(all.into_iter().eq(0..COUNT as usize));
     }
 
     #[test]
-    fn a_panic_in_a_chunk_is_the_callers() {
-        let mut team = Team::start(Duration::from_millis(1)).unwrap();
-        let panicked = std::panic::catch_unwind(std::panic::AssertUnwindSafe(|| {
-            team.each(4, &|chunk| assert!(chunk != 2, "on purpose"));
-        }));
-        assert!(panicked.is_err());
-        team.each(3, &|_| {});
+    fn a_helper_whose_job_panicked_does_the_next() {
+        struct Panicking;
+        impl Job for Panicking {
+            fn help(&self) {
+                panic!("on purpose");
+            }
+        }
+        let team = Team::start(Duration::from_millis(1)).unwrap();
+        let job = Arc::new(Counting::default());
+        team.send(Arc::new(Panicking));
+        while job.0.load(Ordering::SeqCst) == 0 {
+            team.send(Arc::clone(&job) as Arc<dyn Job>);
+            std::thread::sleep(Duration::from_millis(1));
+        }
     }
 }

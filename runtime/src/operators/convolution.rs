@@ -1,16 +1,14 @@
 //! Convolution of kernel 4 and stride 2, norm and `SiLU`, channels last; reads floats or bytes.
 
-use std::sync::PoisonError;
-
 use pulp::Arch;
 use tract_onnx::pb::NodeProto;
 use tract_onnx::tract_hir::internal::*;
 
+use super::CONV;
 use super::build::{Context, own};
-use super::memory::{Pieces, slice};
+use super::memory::slice;
 use super::norm::norm_of;
 use super::own::{Compute, Own};
-use super::{CONV, SharedTeam};
 use crate::kernels::conv::Conv;
 use crate::kernels::norm::Norm;
 
@@ -60,35 +58,25 @@ impl Compute for Block {
         vec![0.0; self.conv.len_padded()]
     }
 
-    fn is_worth_sharing(&self) -> bool {
-        2 * 16 * self.conv.len_in() / 4 * self.conv.channels_out() >= SHARED_FLOPS_MIN
+    fn piece_len(&self) -> Option<usize> {
+        let conv = &self.conv;
+        let flops = 2 * 16 * conv.len_in() / 4 * conv.channels_out();
+        (flops >= SHARED_FLOPS_MIN).then(|| ROWS * conv.side_out() * conv.channels_out())
     }
 
-    fn run(
-        &self,
-        inputs: &[TValue],
-        padded: &mut Vec<f32>,
-        team: Option<&SharedTeam>,
-        out: &mut [f32],
-    ) -> TractResult<()> {
-        let (arch, Self { conv, norm, from_bytes, .. }) = (Arch::new(), self);
-        match from_bytes {
-            Some(change) => conv.pad_bytes(arch, slice(&inputs[0])?, *change, padded),
-            None => conv.pad(slice(&inputs[0])?, padded),
+    fn prepare(&self, inputs: &[TValue], padded: &mut Vec<f32>) -> TractResult<()> {
+        match self.from_bytes {
+            Some(change) => self.conv.pad_bytes(Arch::new(), slice(&inputs[0])?, change, padded),
+            None => self.conv.pad(slice(&inputs[0])?, padded),
         }
-        let (padded, side) = (padded.as_slice(), conv.side_out());
-        let Some(team) = team else {
-            conv.run(arch, padded, 0..side, out);
-            norm.run(arch, out);
-            return Ok(());
-        };
-        let pieces = Pieces::new(out, ROWS * side * conv.channels_out());
-        team.lock().unwrap_or_else(PoisonError::into_inner).each(pieces.count(), &|index| {
-            // SAFETY: a team runs every index once.
-            let out = unsafe { pieces.take(index) };
-            conv.run(arch, padded, ROWS * index..ROWS * (index + 1), out);
-            norm.run(arch, out);
-        });
+        Ok(())
+    }
+
+    fn fill(&self, _: &[TValue], padded: &Vec<f32>, first: usize, out: &mut [f32]) -> TractResult<()> {
+        let (arch, Self { conv, norm, .. }) = (Arch::new(), self);
+        let row = conv.side_out() * conv.channels_out();
+        conv.run(arch, padded, first / row..(first + out.len()) / row, out);
+        norm.run(arch, out);
         Ok(())
     }
 }

@@ -7,7 +7,7 @@ use tract_onnx::tract_hir::internal::*;
 use super::build::{Context, own};
 use super::memory::slice;
 use super::own::{Compute, Own};
-use super::{DRAW, LOG_PROBS, SharedTeam};
+use super::{DRAW, LOG_PROBS};
 use crate::kernels::latents;
 
 pub(super) fn build_log_probs(
@@ -60,13 +60,7 @@ impl Compute for LogProbs {
 
     fn scratch(&self) {}
 
-    fn run(
-        &self,
-        inputs: &[TValue],
-        (): &mut (),
-        _: Option<&SharedTeam>,
-        out: &mut [f32],
-    ) -> TractResult<()> {
+    fn fill(&self, inputs: &[TValue], (): &(), _: usize, out: &mut [f32]) -> TractResult<()> {
         out.copy_from_slice(slice(&inputs[0])?);
         latents::log_probs(Arch::new(), out, self.classes, self.factor, self.offset);
         Ok(())
@@ -90,7 +84,7 @@ impl Compute for Draw {
 
     fn scratch(&self) {}
 
-    fn run(&self, inputs: &[TValue], (): &mut (), _: Option<&SharedTeam>, z: &mut [i64]) -> TractResult<()> {
+    fn fill(&self, inputs: &[TValue], (): &(), _: usize, z: &mut [i64]) -> TractResult<()> {
         latents::draw(slice(&inputs[0])?, slice(&inputs[1])?, self.classes, z);
         Ok(())
     }

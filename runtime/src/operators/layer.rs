@@ -1,16 +1,14 @@
 //! One row: the sum of products, of table rows and of values, perhaps with norm and `SiLU`.
 
-use std::sync::{Mutex, PoisonError};
-
 use pulp::Arch;
 use tract_onnx::pb::NodeProto;
 use tract_onnx::tract_hir::internal::*;
 
 use super::build::{Context, Recipe, own};
-use super::memory::{Pieces, slice};
+use super::memory::slice;
 use super::norm::norm_of;
 use super::own::{Compute, Own};
-use super::{LAYER, SharedTeam, Term};
+use super::{LAYER, Term};
 use crate::kernels::matrix::Matrix;
 use crate::kernels::norm::Norm;
 use crate::kernels::table::Table;
@@ -111,25 +109,6 @@ impl Layer {
         }
         Ok(())
     }
-
-    fn shared_sum(
-        &self,
-        arch: Arch,
-        inputs: &[TValue],
-        out: &mut [f32],
-        team: &SharedTeam,
-    ) -> TractResult<()> {
-        let failed = Mutex::new(None);
-        let pieces = Pieces::new(out, COLUMNS);
-        team.lock().unwrap_or_else(PoisonError::into_inner).each(pieces.count(), &|index| {
-            // SAFETY: a team runs every index once.
-            let out = unsafe { pieces.take(index) };
-            if let Err(error) = self.sum(arch, inputs, COLUMNS * index, out) {
-                *failed.lock().unwrap_or_else(PoisonError::into_inner) = Some(error);
-            }
-        });
-        failed.into_inner().unwrap_or_else(PoisonError::into_inner).map_or(Ok(()), Err)
-    }
 }
 
 fn add(out: &mut [f32], values: &[f32]) {
@@ -187,25 +166,17 @@ impl Compute for Layer {
 
     fn scratch(&self) {}
 
-    fn is_worth_sharing(&self) -> bool {
-        self.weights() >= SHARED_WEIGHTS_MIN
+    fn piece_len(&self) -> Option<usize> {
+        (self.weights() >= SHARED_WEIGHTS_MIN).then_some(COLUMNS)
     }
 
-    fn run(
-        &self,
-        inputs: &[TValue],
-        (): &mut (),
-        team: Option<&SharedTeam>,
-        out: &mut [f32],
-    ) -> TractResult<()> {
-        let arch = Arch::new();
-        match team {
-            None => self.sum(arch, inputs, 0, out)?,
-            Some(team) => self.shared_sum(arch, inputs, out, team)?,
-        }
+    fn fill(&self, inputs: &[TValue], (): &(), first: usize, out: &mut [f32]) -> TractResult<()> {
+        self.sum(Arch::new(), inputs, first, out)
+    }
+
+    fn finish(&self, out: &mut [f32]) {
         if let Some(norm) = &self.norm {
-            norm.run(arch, out);
+            norm.run(Arch::new(), out);
         }
-        Ok(())
     }
 }

@@ -1,6 +1,5 @@
-//! Results in memory that is used again, and pieces of it for two threads.
+//! Results in memory that is used again.
 
-use std::marker::PhantomData;
 use std::sync::Arc;
 
 use tract_onnx::tract_hir::internal::*;
@@ -41,36 +40,4 @@ impl Results {
 /// The contents of an input.
 pub(super) fn slice<T: Datum>(value: &TValue) -> TractResult<&[T]> {
     value.try_as_plain_ram()?.as_slice::<T>()
-}
-
-/// Pieces of a slice, each handed out once.
-pub(super) struct Pieces<'a, T> {
-    start: *mut T,
-    len: usize,
-    piece: usize,
-    of: PhantomData<&'a mut [T]>,
-}
-
-// SAFETY: it is a mutable slice that is taken apart; see `take`.
-unsafe impl<T: Send> Sync for Pieces<'_, T> {}
-
-impl<'a, T> Pieces<'a, T> {
-    pub(super) fn new(slice: &'a mut [T], piece: usize) -> Self {
-        Self { start: slice.as_mut_ptr(), len: slice.len(), piece, of: PhantomData }
-    }
-
-    pub(super) fn count(&self) -> usize {
-        self.len.div_ceil(self.piece)
-    }
-
-    /// The piece of this index.
-    ///
-    /// # Safety
-    /// No index may be taken twice.
-    pub(super) unsafe fn take(&self, index: usize) -> &'a mut [T] {
-        let first = index * self.piece;
-        assert!(first < self.len, "piece {index}");
-        // SAFETY: within the slice that was borrowed mutably for 'a; pieces of different indices do not overlap.
-        unsafe { std::slice::from_raw_parts_mut(self.start.add(first), self.piece.min(self.len - first)) }
-    }
 }

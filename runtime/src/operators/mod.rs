@@ -10,8 +10,9 @@ mod layer;
 mod memory;
 mod norm;
 mod own;
+mod shared;
 
-use std::sync::{Arc, Mutex};
+use std::sync::Arc;
 
 use tract_onnx::prelude::TypedModel;
 
@@ -66,7 +67,7 @@ impl Term {
 }
 
 /// A team that operators of one thread share.
-pub type SharedTeam = Arc<Mutex<Team>>;
+pub type SharedTeam = Arc<Team>;
 
 /// tract's ONNX reader, with our operators.
 #[must_use]

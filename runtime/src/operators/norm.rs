@@ -4,10 +4,10 @@ use pulp::Arch;
 use tract_onnx::pb::NodeProto;
 use tract_onnx::tract_hir::internal::*;
 
+use super::NORM;
 use super::build::{Context, Recipe, own};
 use super::memory::slice;
 use super::own::{Compute, Own};
-use super::{NORM, SharedTeam};
 use crate::kernels::norm::Norm;
 
 pub(super) fn build(_: &Context<'_>, node: &NodeProto) -> TractResult<(Box<dyn InferenceOp>, Vec<String>)> {
@@ -43,13 +43,7 @@ impl Compute for NormRows {
 
     fn scratch(&self) {}
 
-    fn run(
-        &self,
-        inputs: &[TValue],
-        (): &mut (),
-        _: Option<&SharedTeam>,
-        out: &mut [f32],
-    ) -> TractResult<()> {
+    fn fill(&self, inputs: &[TValue], (): &(), _: usize, out: &mut [f32]) -> TractResult<()> {
         out.copy_from_slice(slice(&inputs[0])?);
         self.norm.run(Arch::new(), out);
         Ok(())

@@ -6,13 +6,14 @@ use tract_onnx::tract_hir::internal::*;
 
 use super::SharedTeam;
 use super::memory::Results;
+use super::shared::Lane;
 
 /// The arithmetic of an operator.
 pub(super) trait Compute: std::fmt::Debug + Send + Sync + 'static {
     /// What it computes.
-    type Number: Datum;
+    type Number: Datum + Copy + Default;
     /// Memory that it needs beside its result.
-    type Scratch: std::fmt::Debug + Clone + Send + 'static;
+    type Scratch: std::fmt::Debug + Clone + Send + Sync + 'static;
 
     /// As it stands in the graph.
     const NAME: &'static str;
@@ -23,19 +24,28 @@ pub(super) trait Compute: std::fmt::Debug + Send + Sync + 'static {
     /// Memory for one stream.
     fn scratch(&self) -> Self::Scratch;
 
-    /// Whether it is large enough to share with another thread.
-    fn is_worth_sharing(&self) -> bool {
-        false
+    /// Numbers of the result that are handed over at a time; none where it is too small to be shared with another thread.
+    fn piece_len(&self) -> Option<usize> {
+        None
     }
 
-    /// Fills `out`, whose old contents are those of an earlier run.
-    fn run(
+    /// What comes before the result, once.
+    fn prepare(&self, _inputs: &[TValue], _scratch: &mut Self::Scratch) -> TractResult<()> {
+        Ok(())
+    }
+
+    /// Fills `out`, which begins at number `first` of the result and is some of its pieces, or all. Its old contents are those of an
+    /// earlier run.
+    fn fill(
         &self,
         inputs: &[TValue],
-        scratch: &mut Self::Scratch,
-        team: Option<&SharedTeam>,
+        scratch: &Self::Scratch,
+        first: usize,
         out: &mut [Self::Number],
     ) -> TractResult<()>;
+
+    /// What comes after the whole result, once.
+    fn finish(&self, _out: &mut [Self::Number]) {}
 }
 
 /// An operator in tract, and with whom it shares its work.
@@ -50,7 +60,7 @@ impl<C: Compute> Own<C> {
     /// Shares with this team what is worth it, if the node is an operator of this kind.
     pub(super) fn settle(node: &mut TypedNode, team: Option<&SharedTeam>) {
         if let Some(own) = node.op_as_mut::<Self>() {
-            own.1 = team.filter(|_| own.0.is_worth_sharing()).cloned();
+            own.1 = team.filter(|_| own.0.piece_len().is_some()).cloned();
         }
     }
 }
@@ -82,7 +92,7 @@ impl<C: Compute> EvalOp for Own<C> {
 
     fn state(&self, _: &EvalContext<'_>) -> TractResult<Option<Box<dyn OpState>>> {
         let results = Results::new(C::Number::datum_type(), self.0.shape());
-        Ok(Some(Box::new(OwnState { op: self.clone(), scratch: self.0.scratch(), results })))
+        Ok(Some(Box::new(OwnState::new(self, results))))
     }
 }
 
@@ -98,20 +108,46 @@ impl<C: Compute> TypedOp for Own<C> {
 #[derive(Debug)]
 struct OwnState<C: Compute> {
     op: Own<C>,
-    scratch: C::Scratch,
+    /// More than one only where another thread may still read the last.
+    scratch: Vec<Arc<C::Scratch>>,
+    lane: Option<Arc<Lane<C>>>,
     results: Results,
+}
+
+impl<C: Compute> OwnState<C> {
+    fn new(op: &Own<C>, results: Results) -> Self {
+        let scratch = (0..1 + usize::from(op.1.is_some())).map(|_| Arc::new(op.0.scratch())).collect();
+        let lane = op.1.is_some().then(|| Lane::new(&op.0));
+        Self { op: op.clone(), scratch, lane, results }
+    }
 }
 
 impl<C: Compute> Clone for OwnState<C> {
     fn clone(&self) -> Self {
-        Self { op: self.op.clone(), scratch: self.scratch.clone(), results: self.results.clone() }
+        Self::new(&self.op, self.results.clone())
     }
 }
 
 impl<C: Compute> OpState for OwnState<C> {
     fn eval(&mut self, _: &EvalContext<'_>, _: &dyn Op, inputs: TVec<TValue>) -> TractResult<TVec<TValue>> {
-        let Self { op: Own(compute, team), scratch, results } = self;
-        results.write(|out| compute.run(&inputs, scratch, team.as_ref(), out))
+        let Self { op: Own(compute, team), scratch, lane, results } = self;
+        let free = scratch.iter_mut().position(|scratch| Arc::get_mut(scratch).is_some());
+        let index = free.unwrap_or_else(|| {
+            scratch.push(Arc::new(compute.scratch()));
+            scratch.len() - 1
+        });
+        if let Some(scratch) = Arc::get_mut(&mut scratch[index]) {
+            compute.prepare(&inputs, scratch)?;
+        }
+        let scratch = &scratch[index];
+        results.write(|out| {
+            match (team, lane) {
+                (Some(team), Some(lane)) => lane.fill(team, &inputs, scratch, out)?,
+                _ => compute.fill(&inputs, scratch, 0, out)?,
+            }
+            compute.finish(out);
+            Ok(())
+        })
     }
 
     fn reset_lanes(&mut self, _: &[LaneId]) -> TractResult<()> {

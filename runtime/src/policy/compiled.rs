@@ -6,7 +6,7 @@
 mod branches;
 mod pieces;
 
-use std::sync::{Arc, Mutex};
+use std::sync::Arc;
 use std::time::Duration;
 
 use rcwm_models::ACTION_LEN;
@@ -57,7 +57,7 @@ impl Compiled {
             0 | 1 => None,
             _ => Some(Team::start(HELPER_SPINS).map_err(|error| PolicyError::Thread(error.to_string()))?),
         };
-        let team = team.map(|team| Arc::new(Mutex::new(team)));
+        let team = team.map(Arc::new);
         let mut values = Values::default();
         let (mut early, mut late) = (Vec::new(), Vec::new());
         for segment in compile(bundle, optimizations)? {
@@ -87,7 +87,7 @@ impl Compiled {
 
     /// The actor on the state that is there.
     fn act(&mut self, work: &mut Work<'_>) -> Result<(), PolicyError> {
-        let Self { actor, values, .. } = self;
+        let Self { actor, values, team, .. } = self;
         let Work { buffers, clock, .. } = work;
         let mut run = || {
             actor.run(values)?;
@@ -96,6 +96,8 @@ impl Compiled {
         };
         run().map_err(|error| run_error(PartName::Actor, &error))?;
         clock.ended(PartName::Actor);
+        // In the encoder, or just now.
+        clock.helper_late |= team.as_ref().is_some_and(|team| team.take_late());
         finite(PartName::Actor, "mean", &buffers.mean)?;
         finite(PartName::Actor, "std", &buffers.std)
     }
@@ -186,11 +188,14 @@ impl Tick for Compiled {
         let _ = self.encoder.run(&mut self.values);
         let _ = self.branches.rehearse(&mut self.values, &mut StageClock::start());
         let _ = self.actor.run(&mut self.values);
+        if let Some(team) = &self.team {
+            team.take_late();
+        }
     }
 
     fn wake(&self) {
         if let Some(team) = &self.team {
-            team.lock().unwrap_or_else(std::sync::PoisonError::into_inner).wake();
+            team.wake();
         }
     }
 }

@@ -5,7 +5,7 @@
 //! long as on one thread, however long the helper is gone.
 
 use std::sync::atomic::{AtomicU64, Ordering};
-use std::sync::{Arc, Mutex, MutexGuard, PoisonError, TryLockError};
+use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
 use std::time::{Duration, Instant};
 
 use rcwm_models::bundle::PartName;
@@ -15,12 +15,10 @@ use super::super::PolicyError;
 use super::super::stages::StageClock;
 use super::pieces::{Piece, Values};
 use crate::operators::SharedTeam;
-use crate::team::Team;
+use crate::team::{Job, PATIENCE_MIN, try_lock};
 
 /// The helper is late when the caller has waited for this part of the time that its own branch has taken.
 const PATIENCE: u32 = 4;
-/// And at least so long: two cores are seldom equally fast.
-const PATIENCE_MIN: Duration = Duration::from_micros(15);
 
 /// An error, and the part it comes from.
 pub(super) type RunError = (PartName, TractError);
@@ -97,9 +95,8 @@ struct LaneWork {
     spent_ns: u64,
 }
 
-impl Lane {
-    /// The errand.
-    fn run(&self) {
+impl Job for Lane {
+    fn help(&self) {
         let mut work = self.work.lock().unwrap_or_else(PoisonError::into_inner);
         let start = Instant::now();
         // A helper that was stopped right here may find the next errand, and be sent on it once more.
@@ -110,18 +107,16 @@ impl Lane {
         drop(work);
         self.done.store(errand, Ordering::Release);
     }
+}
 
+impl Lane {
     fn is_done(&self, errand: u64) -> bool {
         self.done.load(Ordering::Acquire) == errand
     }
 
     /// None while the helper is at it.
     fn try_lock(&self) -> Option<MutexGuard<'_, LaneWork>> {
-        match self.work.try_lock() {
-            Ok(work) => Some(work),
-            Err(TryLockError::Poisoned(poisoned)) => Some(poisoned.into_inner()),
-            Err(TryLockError::WouldBlock) => None,
-        }
+        try_lock(&self.work)
     }
 }
 
@@ -130,9 +125,6 @@ impl Beside {
         let spare = environment.twin().map_err(|error| super::run_error(environment.part, &error))?;
         let work = LaneWork { environment, errand: 0, inputs: None, results: None, spent_ns: 0 };
         let lane = Arc::new(Lane { work: Mutex::new(work), done: AtomicU64::new(0) });
-        let errand = Arc::clone(&lane);
-        let set = lock(team).set_errand(Box::new(move || errand.run()));
-        set.map_err(|_| PolicyError::Thread("the helper has another errand".into()))?;
         Ok(Self { team: Arc::clone(team), robot, lane, spare, spare_is_new: true, errand: 0 })
     }
 
@@ -161,7 +153,7 @@ impl Beside {
             work.inputs = Some(work.environment.inputs(values));
             work.results = None;
             drop(work);
-            lock(&self.team).send();
+            self.team.send(Arc::clone(&self.lane) as Arc<dyn Job>);
         }
     }
 
@@ -177,7 +169,7 @@ impl Beside {
         let mut work = self.lane.try_lock().filter(|work| work.errand == self.errand)?;
         if work.results.is_none() {
             // It has not begun, and need not.
-            lock(&self.team).call_off();
+            self.team.call_off();
             work.inputs = None;
         }
         Some((work.results.take()?, work.spent_ns))
@@ -200,10 +192,6 @@ impl Beside {
     }
 }
 
-fn lock(team: &SharedTeam) -> MutexGuard<'_, Team> {
-    team.lock().unwrap_or_else(PoisonError::into_inner)
-}
-
 #[cfg(test)]
 mod tests {
     use prost::Message;
@@ -211,6 +199,7 @@ mod tests {
 
     use super::*;
     use crate::compile::{Fact, Segment};
+    use crate::team::Team;
 
     const LEN: usize = 8;
 
@@ -249,7 +238,7 @@ mod tests {
         let mut values = Values::default();
         let robot = negation(PartName::Robot, "robot", &mut values);
         let environment = negation(PartName::Environment, "environment", &mut values);
-        let team = Arc::new(Mutex::new(Team::start(Duration::from_millis(1)).unwrap()));
+        let team = Arc::new(Team::start(Duration::from_millis(1)).unwrap());
         (Beside::new(robot, environment, &team).unwrap(), values)
     }
 
