@@ -43,8 +43,15 @@ fn main() -> anyhow::Result<()> {
     let arguments = Arguments::parse();
     let link = SimulatorLink::open(LinkSettings::new(&arguments.instance))?;
     let period_ns = if arguments.rate_hz > 0.0 { (1e9 / arguments.rate_hz) as u64 } else { 0 };
-    let mut robot =
-        Robot { link, period_ns, due_ns: 0, sequence: 0, held: 0, timeout_s: arguments.timeout_s };
+    let mut robot = Robot {
+        link,
+        period_ns,
+        due_ns: 0,
+        sequence: 0,
+        held: 0,
+        abandoned: false,
+        timeout_s: arguments.timeout_s,
+    };
     for episode in 0..arguments.episodes {
         let total_reward = robot.episode(episode, arguments.steps)?;
         println!("episode {episode}: {} observations, reward {total_reward:.2}", arguments.steps);
@@ -62,6 +69,8 @@ struct Robot {
     sequence: u64,
     /// Steps on which no answer had come in time.
     held: u64,
+    /// The controller has said that it leaves, and none has answered since.
+    abandoned: bool,
     timeout_s: f64,
 }
 
@@ -83,13 +92,19 @@ impl Robot {
             observation.executed_action = executed;
             observation.image = table.picture();
             total_reward += f64::from(observation.reward);
-            let answer = self.ask(observation)?;
+            // What is no number is no answer, whoever sent it.
+            let answer = self.ask(observation)?.map(|answer| answer.action);
+            let answer = answer.filter(|action| action.iter().all(|value| value.is_finite()));
             held = answer.is_none();
             self.held += u64::from(held);
-            // Without an answer the last action goes on. What is no number is never executed, whoever sent it.
-            let action = answer.map_or(executed, |answer| answer.action);
-            executed =
-                table.step(action.map(|value| if value.is_finite() { value.clamp(-1.0, 1.0) } else { 0.0 }));
+            let action = match answer {
+                Some(action) => action.map(|value| value.clamp(-1.0, 1.0)),
+                // Nobody steers any more. The hand moves by its actions, so that it rests with zeros; an arm holds its position.
+                None if self.abandoned => [0.0; ACTION_LEN],
+                // Without an answer the last action goes on.
+                None => executed,
+            };
+            executed = table.step(action);
         }
         Ok(total_reward)
     }
@@ -114,8 +129,12 @@ impl Robot {
             if left.is_zero() {
                 break;
             }
-            match self.link.wait_action(left)? {
-                (Wait::Message(action), _) if action.answers == observation.sequence => answer = Some(action),
+            let (wait, events) = self.link.wait_action(left)?;
+            self.abandoned |= events.closed;
+            match (wait, events) {
+                (Wait::Message(action), _) if action.answers == observation.sequence => {
+                    (answer, self.abandoned) = (Some(action), false);
+                }
                 // A controller that has just connected has not seen it.
                 (Wait::TimedOut, events) if events.hello => {
                     observation.flags |= ObservationFlags::REPEATED.0;

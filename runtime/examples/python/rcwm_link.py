@@ -61,7 +61,7 @@ class Action(ctypes.Structure):
 
 
 class PeerClosed(Exception):
-    """The other side said that it closes."""
+    """The other side said that it closes: a controller sends no further action, a simulator no further observation."""
 
 
 class _Link:
@@ -187,7 +187,9 @@ class SimulatorLink(_Link):
     def step(self, observation: Observation, timeout_s: float) -> Action | None:
         """Publishes an observation and waits for the action that answers it (lock-step).
 
-        A controller that connects in the meantime gets the observation again. None when the time is up.
+        A controller that connects in the meantime gets the observation again. None when the time is up. Raises PeerClosed
+        when the controller has said that it ends and no answer has come: bring the robot to rest. Calling this again with
+        the same observation waits for the next controller.
         """
         deadline = time.monotonic() + timeout_s
         self._send(observation)
@@ -195,8 +197,12 @@ class SimulatorLink(_Link):
             action = self._receive(max(0.0, deadline - time.monotonic()))
             if action is not None and action.answers == observation.sequence:
                 return action
-            if _HELLO in self._seen:
+            if action is None and _CLOSED in self._seen:
                 self._seen.clear()
+                observation.flags |= REPEATED
+                raise PeerClosed("the controller has closed")
+            if _HELLO in self._seen:
+                self._seen.discard(_HELLO)
                 observation.flags |= REPEATED
                 self._send(observation)
             elif action is None:

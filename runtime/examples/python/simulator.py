@@ -11,8 +11,9 @@ import ctypes
 import json
 import math
 import random
+import sys
 
-from rcwm_link import FIRST, IMAGE_SIDE, LAST, OWN_TASK, SUCCESS, Observation, SimulatorLink
+from rcwm_link import FIRST, IMAGE_SIDE, LAST, OWN_TASK, SUCCESS, Observation, PeerClosed, SimulatorLink
 
 
 class Table:
@@ -35,6 +36,16 @@ class Table:
                 start = 3 * (line * IMAGE_SIDE + column)
                 image[start : start + 12] = colour * 4
         return bytes(image)
+
+
+def ask(link: SimulatorLink, observation: Observation, timeout_s: float):
+    """The answer to an observation, of the next controller where one leaves; None when the time is up."""
+    while True:
+        try:
+            return link.step(observation, timeout_s)
+        except PeerClosed:
+            # A robot that moves by itself comes to rest here: nobody steers it any more.
+            print("the controller has closed: at rest until the next one answers", file=sys.stderr)
 
 
 def main() -> None:
@@ -60,7 +71,7 @@ def main() -> None:
                 observation.flags = (FIRST if step == 0 else 0) | (LAST if step == options.steps - 1 else 0) | (SUCCESS if near else 0)
                 ctypes.memmove(observation.image, table.picture(), ctypes.sizeof(observation.image))
                 counts["observations"] += 1
-                answer = link.step(observation, options.timeout_s)
+                answer = ask(link, observation, options.timeout_s)
                 if answer is None:
                     raise SystemExit(f"no answer on {options.instance!r} within {options.timeout_s} s: is a controller running?")
                 counts["answers"] += 1

@@ -33,7 +33,8 @@ Examples:
   rcwm-simulator serve --task reach --episodes 3
       three episodes in lock-step with whatever controller connects to instance `rcwm`
   rcwm-simulator serve --task hammer --instance arm1 --pace realtime --rate-hz 40
-      a fixed clock; the last action is held when no answer has come in time
+      a fixed clock; the last action is held when no answer has come in time, for a second at most and not at all after
+      the controller has said that it leaves: then the hand rests
   rcwm-simulator serve --task door-open --policy mixed --masks --episodes 16
       expert data with noise and robot masks for a recorder, which acknowledges each observation
   rcwm-simulator serve --task hammer --policy expert --free-run --masks --episodes 1 --snapshot pictures

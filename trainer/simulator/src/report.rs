@@ -76,6 +76,8 @@ pub struct Tally {
     pub repeated: u64,
     /// Steps for which no valid answer had come.
     pub held: u64,
+    /// Those of them at which the robot rested, because the controller had left or been silent for long (real time).
+    pub rested: u64,
     /// Actions that answered another observation than the present one.
     pub dropped: u64,
     /// Actions with a value that is not finite.
@@ -114,6 +116,7 @@ pub struct Report {
     pub seconds: f64,
     pub steps_per_s: f64,
     pub actions_held: u64,
+    pub steps_at_rest: u64,
     pub actions_dropped: u64,
     pub actions_refused: u64,
     pub ticks_missed: u64,
@@ -147,6 +150,7 @@ impl Tally {
             seconds: self.seconds,
             steps_per_s: if self.seconds > 0.0 { self.steps as f64 / self.seconds } else { 0.0 },
             actions_held: self.held,
+            steps_at_rest: self.rested,
             actions_dropped: self.dropped,
             actions_refused: self.refused,
             ticks_missed: self.missed,
@@ -192,8 +196,8 @@ impl fmt::Display for Report {
         )?;
         writeln!(
             f,
-            "  actions      {} held, {} dropped (late or doubled), {} refused (not finite)",
-            self.actions_held, self.actions_dropped, self.actions_refused
+            "  actions      {} held ({} of them at rest), {} dropped (late or doubled), {} refused (not finite)",
+            self.actions_held, self.steps_at_rest, self.actions_dropped, self.actions_refused
         )?;
         if self.ticks_missed > 0 {
             writeln!(f, "  clock        {} ticks missed", self.ticks_missed)?;

@@ -1,7 +1,8 @@
 //! The serving loop: publish an observation, get an action, execute it.
 //!
 //! A controller may come, go or die at any time: in lock-step the present observation is published again for the next one, in
-//! real time the last action is held until there is one.
+//! real time the last action is held for a while, and not at all when the controller has said that it leaves: then the robot rests
+//! until the next one answers.
 
 use std::path::PathBuf;
 use std::sync::atomic::{AtomicBool, Ordering};
@@ -21,6 +22,8 @@ use crate::{SimulatorError, snapshot};
 const WAIT_SLICE: Duration = Duration::from_millis(100);
 /// After so much silence a lock-step observation is published again: its receiver may have died with it.
 const SILENCE: Duration = Duration::from_secs(1);
+/// In real time, the last action is held for so long without an answer; then the robot rests.
+const HOLD_NS_MAX: u64 = 1_000_000_000;
 /// Steps between two snapshots of the first episode.
 const SNAPSHOT_STEPS: u32 = 50;
 
@@ -84,6 +87,11 @@ struct Published {
 /// An answer to the present observation, fit to be executed; `None` when there was none.
 type Answer = Option<[f32; ACTION_LEN]>;
 
+/// The hand stays where it is, for actions are displacements; the gripper goes on with what it does.
+fn at_rest([_, _, _, grip]: [f32; ACTION_LEN]) -> [f32; ACTION_LEN] {
+    [0.0, 0.0, 0.0, grip]
+}
+
 /// Serves until the episodes are done or `stop` is set, then says goodbye to the controller.
 ///
 /// `progress` is called with each new place: episode and step.
@@ -104,6 +112,8 @@ pub fn serve(
         stop,
         tally: Tally::default(),
         place: Place::default(),
+        abandoned: false,
+        held_in_a_row: 0,
         met_controller: false,
         started: Instant::now(),
         progress: &progress,
@@ -124,6 +134,10 @@ struct Server<'a> {
     stop: &'a AtomicBool,
     tally: Tally,
     place: Place,
+    /// The controller has said that it leaves, and none has answered since.
+    abandoned: bool,
+    /// Steps without an answer in a row.
+    held_in_a_row: u64,
     /// Whether any answer has come; the fixed clock does not start before.
     met_controller: bool,
     /// When the first answer came, or the loop began where none is waited for.
@@ -186,10 +200,17 @@ impl Server<'_> {
         }
     }
 
-    /// Executes an answer, or holds the last action where there is none: zeros at the first step of an episode.
+    /// Executes an answer. Where there is none it holds the last action (zeros at the first step of an episode), or rests.
     fn execute(&mut self, action: Answer) -> Result<(), SimulatorError> {
         self.place.held = action.is_none();
-        let action = action.map_or(self.place.executed, |action| action.map(|x| x.clamp(-1.0, 1.0)));
+        self.held_in_a_row = if self.place.held { self.held_in_a_row.saturating_add(1) } else { 0 };
+        let rests = self.place.held && self.rests();
+        let action = match action {
+            Some(action) => action.map(|x| x.clamp(-1.0, 1.0)),
+            None if rests => at_rest(self.place.executed),
+            None => self.place.executed,
+        };
+        self.tally.rested += u64::from(rests);
         let start_ns = monotonic_ns();
         self.environment.step(action)?;
         self.tally.work.add_ns(monotonic_ns() - start_ns);
@@ -198,6 +219,16 @@ impl Server<'_> {
         self.place.step += 1;
         self.place.executed = action;
         Ok(())
+    }
+
+    /// Whether a step without an answer is one at rest: nobody steers any more.
+    fn rests(&self) -> bool {
+        match self.settings.pace {
+            Pace::RealTime { period_ns } => {
+                self.abandoned || self.held_in_a_row.saturating_mul(period_ns) > HOLD_NS_MAX
+            }
+            Pace::LockStep | Pace::Free => false,
+        }
     }
 
     fn publish_new(&mut self, due_ns: u64, sum: &mut f64, solved: &mut bool) -> Result<(), SimulatorError> {
@@ -297,9 +328,12 @@ impl Server<'_> {
         }
         let events = self.link.poll_events()?;
         self.note(events);
+        self.abandoned |= events.closed;
         let answer = match self.link.poll_action()? {
             Some(action) if self.is_answer(&action) => {
                 self.meet_controller(action.published_ns);
+                // An answer that came with a goodbye was the last one.
+                self.abandoned = events.closed;
                 self.checked(&action)
             }
             _ => None,

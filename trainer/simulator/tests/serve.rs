@@ -7,7 +7,8 @@ use std::time::{Duration, Instant};
 
 use rcwm_models::ACTION_LEN;
 use rcwm_models::wire::{
-    Action, ActionSource, ControllerLink, LinkSettings, Observation, ObservationFlags, SimulatorLink, Wait,
+    Action, ActionSource, ControllerLink, LinkSettings, Observation, ObservationFlags, ObserverLink,
+    SimulatorLink, Wait,
 };
 use rcwm_simulator::environment::{Disturbance, Environment, EnvironmentSettings, Layouts};
 use rcwm_simulator::policy::Policy;
@@ -202,6 +203,65 @@ fn in_real_time_a_silent_controller_has_its_last_action_held() {
     assert!(last.is(ObservationFlags::ACTION_HELD) && last.period_ns == 100_000_000);
     assert!(tally.held >= 5, "{} held", tally.held);
     assert_eq!(tally.steps, 8);
+}
+
+/// In real time, moves until step 2, then does `leave`; gives what was executed step by step until the episode's end.
+fn moved_until_left(
+    instance: &str,
+    period_ns: u64,
+    steps_max: u32,
+    leave: impl FnOnce(ControllerLink) -> Option<ControllerLink> + Send + 'static,
+) -> (Tally, Vec<Observation>) {
+    let pace = Pace::RealTime { period_ns };
+    let settings = ServeSettings { episodes: Some(1), steps_max, pace, ..serve_settings(instance) };
+    run(&settings, &AtomicBool::new(false), move |settings| {
+        let watcher = ObserverLink::open(settings.clone()).unwrap();
+        let link = ControllerLink::open(settings).unwrap();
+        let mut observation = next(&link).unwrap();
+        while observation.step < 2 {
+            link.send(action(observation.sequence, [0.5, -0.5, 0.25, 0.75])).unwrap();
+            observation = next(&link).unwrap();
+        }
+        link.send(action(observation.sequence, [0.5, -0.5, 0.25, 0.75])).unwrap();
+        let left = leave(link);
+        let (start, mut seen) = (Instant::now(), Vec::new());
+        while start.elapsed() < PATIENCE {
+            match watcher.wait_observation(Duration::from_millis(100)).unwrap() {
+                Wait::Message(observation) => seen.push(*observation),
+                Wait::TimedOut => {}
+                Wait::Closed => break,
+            }
+        }
+        drop(left);
+        seen
+    })
+}
+
+const AT_REST: [f32; ACTION_LEN] = [0.0, 0.0, 0.0, 0.75];
+
+#[test]
+fn in_real_time_the_robot_rests_once_its_controller_has_said_that_it_leaves() {
+    let (tally, seen) = moved_until_left("left", 100_000_000, 8, |link| {
+        // In time for the present step, so that its answer is executed.
+        std::thread::sleep(Duration::from_millis(150));
+        link.close().unwrap();
+        None
+    });
+    let last = seen.last().unwrap();
+    assert_eq!((last.step, last.executed_action), (8, AT_REST));
+    assert!(last.is(ObservationFlags::ACTION_HELD));
+    assert!(tally.rested >= 3 && tally.rested <= tally.held, "{} rested, {} held", tally.rested, tally.held);
+    assert_eq!(tally.controllers_left, 1);
+}
+
+#[test]
+fn in_real_time_the_robot_rests_when_its_controller_has_been_silent_for_a_second() {
+    // Silent, but there: as one that is stopped, or was killed.
+    let (tally, seen) = moved_until_left("silent", 100_000_000, 20, Some);
+    let moving = seen.iter().filter(|o| o.is(ObservationFlags::ACTION_HELD) && o.executed_action != AT_REST);
+    assert!(moving.count() >= 3, "held at first");
+    assert_eq!(seen.last().unwrap().executed_action, AT_REST);
+    assert!((1..tally.held).contains(&tally.rested), "{} rested, {} held", tally.rested, tally.held);
 }
 
 #[test]
