@@ -14,9 +14,9 @@
 pub mod conv;
 pub mod latents;
 mod math;
-#[cfg(test)]
-mod not_finite;
 pub mod matrix;
 pub mod norm;
+#[cfg(test)]
+mod not_finite;
 pub mod table;
 pub mod weights;
