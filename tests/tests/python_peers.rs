@@ -1,6 +1,6 @@
 //! The wire spoken from Python (`runtime/examples/python`), on either side.
 
-use rcwm_tests::{Domain, Running, read_json, root, shipped_bundle};
+use rcwm_tests::{Domain, Running, output, read_json, root, shipped_bundle};
 
 #[test]
 fn a_python_controller_drives_the_simulator() {
@@ -55,4 +55,20 @@ fn a_python_simulator_is_driven_by_the_runtime() {
     assert_eq!(right["whole_episodes"], 2);
     assert_eq!(right["episodes"][0]["task"], "own");
     assert_eq!(domain.leftovers(), Vec::<String>::new());
+}
+
+#[test]
+fn a_python_robot_is_told_that_its_controller_has_closed() {
+    let domain = Domain::new();
+    let mut command = domain.command("rcwm-runtime");
+    command.args(["run", "--instance", "python", "--episodes", "1", "--bundle"]).arg(shipped_bundle());
+    let mut runtime = Running::start(command);
+    let mut command = domain.python(&root().join("runtime/examples/python/simulator.py"));
+    command.args(["--instance", "python", "--episodes", "2", "--steps", "5", "--timeout-s", "20"]);
+    let simulator = output(command);
+    runtime.succeed();
+    let said = String::from_utf8_lossy(&simulator.stderr);
+    assert!(said.contains("the controller has closed"), "{said}");
+    // And no other came.
+    assert!(!simulator.status.success() && said.contains("no answer"), "{said}");
 }
