@@ -18,7 +18,7 @@ const SHOWN: [&str; 4] = ["true", "imagined", "robot", "environment"];
 /// Between the part of a map that looks at z and the one that looks at h.
 const PART_GAP: u32 = 3;
 /// The brightest colour stands for this many times the weight that every row gets if all get the same, and for all above.
-const BRIGHTEST_TIMES_EVEN: f32 = 4.0;
+pub const BRIGHTEST_TIMES_EVEN: f32 = 4.0;
 /// Size of the colour scale.
 const SCALE_SIZE: (u32, u32) = (256, 14);
 /// Dark to bright, evenly for the eye and in grey too (after viridis).

@@ -48,7 +48,7 @@ mod statistics;
 mod table;
 mod trajectories;
 
-pub use attention::{Attention, AttentionFilm};
+pub use attention::{Attention, AttentionFilm, BRIGHTEST_TIMES_EVEN};
 pub use attention_spread::{AttentionMaps, AttentionSpread};
 pub use closed_loop::{
     ClosedLoopError, ClosedLoopReport, ClosedLoopSettings, Position, closed_loop, recorded_episode,

@@ -214,7 +214,10 @@ fn seed_rows(text: &mut String, group: &SeedGroup, width: usize) {
     for rows in group.rows.chunk_by(|a, b| (&a.task, &a.kind) == (&b.task, &b.kind)) {
         let cell = |measure: Measure, scale: f64| {
             let found = rows.iter().find(|row| row.measure == measure);
-            found.map_or("-".to_owned(), |row| format!("{:.3} +- {:.3}", row.mean * scale, row.std * scale))
+            found.map_or("-".to_owned(), |row| match row.values.len() {
+                1 => format!("{:.3}", row.mean * scale),
+                _ => format!("{:.3} +- {:.3}", row.mean * scale, row.std * scale),
+            })
         };
         let _ = writeln!(
             text,

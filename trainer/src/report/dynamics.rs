@@ -6,7 +6,8 @@ use serde::{Deserialize, Serialize};
 use super::{Draft, Measurement, ReportError, shown_words};
 use crate::checkpoint::{Checkpoint, CheckpointSettings};
 use crate::evaluation::{
-    Attention, AttentionFilm, Latents, OpenLoopSettings, Recordings, TaskReport, TaskTrajectories, measure,
+    Attention, AttentionFilm, BRIGHTEST_TIMES_EVEN, Latents, OpenLoopSettings, Recordings, TaskReport,
+    TaskTrajectories, measure,
 };
 use crate::model::agent::Agent;
 
@@ -55,7 +56,7 @@ pub struct Dynamics {
     pub episode_of: Vec<usize>,
     /// Mean robot dynamics error of each trajectory.
     pub robot_errors: Vec<Option<f64>>,
-    /// Which of the part's pictures are films of two action sequences from one start; the others are strips.
+    /// Which of the part's pictures show two action sequences from one start.
     #[serde(default)]
     pub response_pictures: Vec<usize>,
 }
@@ -77,6 +78,10 @@ pub struct AttentionSource {
     pub latents: Latents,
     /// Which episode, and the draws.
     pub seed: u64,
+    /// How many times the even weight the brightest colour stands for; 0 in parts whose colours went from the film's least weight to its
+    /// largest.
+    #[serde(default)]
+    pub brightest_times_even: f32,
 }
 
 /// The attention of a model on one trajectory; none for a model without interaction.
@@ -154,6 +159,7 @@ impl Subject {
             context: settings.context,
             latents: settings.latents,
             seed: settings.seed,
+            brightest_times_even: BRIGHTEST_TIMES_EVEN,
         }
     }
 
@@ -177,7 +183,7 @@ impl Subject {
         let mut response_pictures = Vec::new();
         for (number, film) in measured.response_films.iter().enumerate() {
             response_pictures.push(draft.pictures());
-            film.write_gif(&draft.picture(&format!("response-{number}.gif")))?;
+            film.write_strip(STRIP_EVERY, &draft.picture(&format!("response-{number}.png")))?;
         }
         Ok(Dynamics {
             checkpoint: self.settings.clone(),

@@ -12,6 +12,7 @@
 //! | `dynamics` | a model on recorded trajectories, and its attention |
 //! | `results` | result files that were measured elsewhere |
 //! | `learning` | runs that were evaluated while they learned |
+//! | `pooled` | policies of several training seeds, taken together and compared |
 //! | `page` | the page and `report.json` |
 //! | `sections` | what stands on the page |
 //! | `html` | pictures, tables and intervals in HTML |
@@ -22,6 +23,7 @@ mod learning;
 mod made;
 mod page;
 mod parts;
+mod pooled;
 mod results;
 mod sections;
 mod success;
@@ -31,6 +33,7 @@ pub use learning::{Learning, LearningCurve, LearningPoint, LearningRun, Learning
 pub use made::{Made, shown_path, shown_words};
 pub use page::Report;
 pub use parts::{Draft, Measurement, Part, Store};
+pub use pooled::{Pooled, SuccessComparison};
 pub use results::{ResultEntry, Results, ResultsSource};
 pub use success::{Policy, Success, SuccessFilm, SuccessSource, Tick, policies};
 

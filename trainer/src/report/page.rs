@@ -5,12 +5,11 @@ use rcwm_models::files::{read_capped, write_atomic};
 use rcwm_models::settings::ModelKind;
 use serde::Serialize;
 
-use super::results::Pooled;
 use super::{
-    AttentionPart, Dynamics, Learning, LearningCurve, Made, Part, ReportError, Results, Store, Success, html,
-    sections,
+    AttentionPart, Dynamics, Learning, LearningCurve, Made, Part, Pooled, ReportError, Results, Store, Success,
+    SuccessComparison, html, pooled, sections, success,
 };
-use crate::evaluation::Comparison;
+use crate::evaluation::{Comparison, OverSeeds, Trained};
 
 /// Version of `report.json`.
 const FORMAT: u32 = 1;
@@ -43,6 +42,12 @@ pub struct Report {
     pub learning: Vec<Part<Learning>>,
     /// The same, by label.
     pub learning_curves: Vec<LearningCurve>,
+    /// Every later label against the first.
+    pub success_comparisons: Vec<SuccessComparison>,
+    /// Policies in closed loop that differ in their training seed only, taken together, and these compared.
+    pub policies_over_seeds: (Vec<Pooled>, Vec<SuccessComparison>),
+    /// Models on recorded trajectories that differ in their training seed only, taken together, and these compared.
+    pub over_seeds: Vec<SeedsPart>,
     #[serde(skip)]
     pub(super) store: Store,
 }
@@ -55,6 +60,16 @@ pub struct Compared {
     /// The comparison.
     #[serde(flatten)]
     pub comparison: Comparison,
+}
+
+/// Training seeds taken together on one task's trajectories.
+#[derive(Debug, Clone, PartialEq, Serialize)]
+pub struct SeedsPart {
+    /// How the data were disturbed.
+    pub disturb: String,
+    /// Groups and comparisons.
+    #[serde(flatten)]
+    pub over: OverSeeds,
 }
 
 impl Report {
@@ -70,15 +85,21 @@ impl Report {
             .sort_by_key(|part| (part.source.task.clone(), part.source.disturb.clone(), is_baseline(part)));
         let results: Vec<Part<Results>> = store.all()?;
         let learning: Vec<Part<Learning>> = store.all()?;
+        let success: Vec<Part<Success>> = store.all()?;
+        let by_label: Vec<Pooled> = results.iter().flat_map(|part| part.measured.pooled()).collect();
+        let by_policy = success::over_seeds(&success);
         Ok(Self {
             format: FORMAT,
             made,
             command,
-            success: store.all()?,
+            success,
             comparisons: compared(&dynamics),
+            over_seeds: over_seeds(&dynamics),
             dynamics,
             attention: store.all()?,
-            pooled: results.iter().flat_map(|part| part.measured.pooled()).collect(),
+            success_comparisons: pooled::compared(&by_label),
+            pooled: by_label,
+            policies_over_seeds: (by_policy.clone(), pooled::compared(&by_policy)),
             results,
             learning_curves: learning.iter().flat_map(|part| part.measured.curves()).collect(),
             learning,
@@ -127,6 +148,31 @@ impl Report {
     }
 }
 
+/// Models that were measured on the same trajectories, over training seeds.
+fn over_seeds(parts: &[Part<Dynamics>]) -> Vec<SeedsPart> {
+    let same = |a: &Part<Dynamics>, b: &Part<Dynamics>| {
+        let (a, b) = (&a.source, &b.source);
+        (&a.task, &a.data_sha256, &a.disturb, a.settings) == (&b.task, &b.data_sha256, &b.disturb, b.settings)
+    };
+    let mut groups: Vec<Vec<&Part<Dynamics>>> = Vec::new();
+    for part in parts {
+        match groups.iter_mut().find(|group| same(group[0], part)) {
+            Some(group) => group.push(part),
+            None => groups.push(vec![part]),
+        }
+    }
+    let of = |group: Vec<&Part<Dynamics>>| {
+        let trained = group.iter().map(|part| Trained {
+            name: &part.source.model,
+            settings: &part.measured.checkpoint,
+            tasks: std::slice::from_ref(&part.measured.report),
+        });
+        let over = OverSeeds::of(&trained.collect::<Vec<_>>(), group[0].source.settings.seed);
+        SeedsPart { disturb: group[0].source.disturb.clone(), over }
+    };
+    groups.into_iter().map(of).filter(|part| part.over != OverSeeds::default()).collect()
+}
+
 /// Every RCWM against every baseline that was measured on the same trajectories.
 fn compared(parts: &[Part<Dynamics>]) -> Vec<Compared> {
     let of = |kind: ModelKind| parts.iter().filter(move |part| part.measured.checkpoint.model.kind == kind);
@@ -158,8 +204,11 @@ mod tests {
     use rcwm_models::settings::{ModelSettings, Preset};
 
     use super::*;
-    use crate::evaluation::wilson;
-    use crate::report::{SuccessFilm, SuccessSource};
+    use crate::checkpoint::CheckpointSettings;
+    use crate::evaluation::{
+        Answer, Measure, OpenLoopSettings, OtherActions, Response, Series, Share, TaskReport, wilson,
+    };
+    use crate::report::{DynamicsSource, SuccessFilm, SuccessSource};
 
     fn page(store: &Store) -> String {
         Report::read(store, Made::now("cpu"), "rcwm-trainer evaluate --report r".into())
@@ -169,6 +218,10 @@ mod tests {
     }
 
     fn keep(store: &Store, policy: &str, solved: bool) {
+        keep_training(store, policy, solved, 0);
+    }
+
+    fn keep_training(store: &Store, policy: &str, solved: bool, seed: u64) {
         let source = SuccessSource {
             policy: policy.into(),
             task: "hammer".into(),
@@ -186,7 +239,7 @@ mod tests {
             preset: "debug".into(),
             data: "data".into(),
             updates: 1,
-            seeds: vec![0],
+            seeds: vec![seed],
             source_revision: String::new(),
         };
         let success = Success {
@@ -241,5 +294,100 @@ mod tests {
         assert_eq!(json["success"][0]["measured"]["successful"], serde_json::json!([false]));
         assert!(folder.path().join("index.html").is_file());
         assert!(store.all::<Results>().unwrap().is_empty());
+    }
+
+    fn keep_dynamics(store: &Store, kind: ModelKind, seed: u64, error: f64) {
+        let name = format!("{kind:?}-{seed}");
+        let source = DynamicsSource {
+            model: name.clone(),
+            weights_sha256: name,
+            task: "hammer".into(),
+            disturb: "none".into(),
+            data_sha256: "ab".into(),
+            settings: OpenLoopSettings::default(),
+        };
+        let checkpoint = CheckpointSettings {
+            format: crate::checkpoint::FORMAT,
+            preset: "debug".into(),
+            seed,
+            updates: 7,
+            data: "data".into(),
+            cpu_seconds: 0.0,
+            weights_sha256: String::new(),
+            model: ModelSettings::preset(Preset::Debug, kind),
+        };
+        let series = |mean: f64| Series {
+            mean: Some(mean),
+            std: Some(0.0),
+            interval: None,
+            step_mean: vec![Some(mean)],
+            step_std: vec![Some(0.0)],
+        };
+        let measures = Measure::ALL.map(|measure| (measure, series(error)));
+        let share = Share { share: Some(0.25), interval: None, imagined: 0.1, truth: 0.2 };
+        let report = TaskReport {
+            task: "hammer".into(),
+            trajectories: 3,
+            episodes: 2,
+            imagined: measures.clone().into(),
+            posterior: measures.into(),
+            kinds: Vec::new(),
+            response: Some(Response {
+                other: OtherActions::Still,
+                answers: [(Answer::Environment, share)].into(),
+            }),
+            attention: None,
+        };
+        let mut draft = store.draft::<Dynamics>(&source).unwrap();
+        for picture in ["strip-0.png", "response-0.png"] {
+            std::fs::write(draft.picture(picture), b"\x89PNG").unwrap();
+        }
+        let (episode_of, robot_errors) = (vec![0, 0, 1], vec![Some(error); 3]);
+        let found = Dynamics { checkpoint, report, episode_of, robot_errors, response_pictures: vec![1] };
+        store.keep(draft, source, found, Made::now("cpu"), 1.0).unwrap();
+    }
+
+    #[test]
+    fn models_of_several_seeds_are_compared_over_seeds_and_each_picture_has_its_section() {
+        let folder = tempfile::tempdir().unwrap();
+        let store = Store::open(folder.path()).unwrap();
+        for (seed, error) in [(0, 1.0), (1, 3.0)] {
+            keep_dynamics(&store, ModelKind::Rcwm, seed, error);
+            keep_dynamics(&store, ModelKind::Vanilla, seed, 4.0);
+        }
+        let report = Report::read(&store, Made::now("cpu"), String::new()).unwrap();
+        let [part] = report.over_seeds.as_slice() else { panic!("{:?}", report.over_seeds) };
+        let comparison = &part.over.comparisons[0];
+        let interval = comparison.interval.unwrap();
+        assert_eq!((comparison.ratio, interval.low, interval.high), (0.5, 0.25, 0.75));
+        let page = report.html().unwrap();
+        assert!(page.contains("2 and 2 training seeds; fewer than 5: no result yet"));
+        assert_eq!(
+            page.matches("with the robot held still in place").count(),
+            4,
+            "two action sequences each"
+        );
+        assert_eq!(
+            page.matches("alt=\"hammer, Rcwm-0\"").count(),
+            2,
+            "each picture once, in its own section"
+        );
+        assert!(page.contains("0.250"));
+    }
+
+    #[test]
+    fn policies_that_differ_in_their_training_seed_are_taken_together() {
+        let folder = tempfile::tempdir().unwrap();
+        let store = Store::open(folder.path()).unwrap();
+        keep_training(&store, "first", true, 0);
+        keep_training(&store, "second", false, 1);
+        let report = Report::read(&store, Made::now("cpu"), String::new()).unwrap();
+        let [pooled] = report.policies_over_seeds.0.as_slice() else { panic!("two trainings") };
+        assert_eq!((pooled.label.as_str(), pooled.rates.clone()), ("first, second", vec![1.0, 0.0]));
+        assert!(report.html().unwrap().contains("2 seeds; fewer than 5: no result yet"));
+        // The same seed twice is no second training.
+        keep_training(&store, "second", false, 0);
+        let report = Report::read(&store, Made::now("cpu"), String::new()).unwrap();
+        assert!(report.policies_over_seeds.0.is_empty());
     }
 }

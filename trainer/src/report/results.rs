@@ -4,8 +4,9 @@ use std::path::{Path, PathBuf};
 use rcwm_models::files::sha256_hex;
 use serde::{Deserialize, Serialize};
 
+use super::pooled::{Pooled, Training, pool};
 use super::{Measurement, ReportError, shown_path};
-use crate::evaluation::{ClosedLoopResults, Interval, mean_and_std, wilson};
+use crate::evaluation::ClosedLoopResults;
 
 /// The result files that were given last.
 #[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
@@ -17,8 +18,11 @@ pub struct ResultsSource {
 /// One policy on one task, as a result file says.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 pub struct ResultEntry {
-    /// What it is compared as: entries of one label are seeds of the same.
+    /// What it is compared as: policies of one label are trainings of the same that differ in their seed.
     pub label: String,
+    /// Tells policies apart: a checksum of where the policy lay, or of the file that does not say it.
+    #[serde(default)]
+    pub policy: String,
     /// Where the policy lay.
     pub of: String,
     /// The task.
@@ -40,29 +44,6 @@ pub struct ResultEntry {
 pub struct Results {
     /// In the order they were given.
     pub entries: Vec<ResultEntry>,
-}
-
-/// Entries of one label on one task, taken together.
-#[derive(Debug, Clone, PartialEq, Serialize)]
-pub struct Pooled {
-    /// Label.
-    pub label: String,
-    /// Task.
-    pub task: String,
-    /// Visual disturbance.
-    pub disturb: String,
-    /// Episodes in all.
-    pub episodes: usize,
-    /// Those that were solved.
-    pub successes: usize,
-    /// Wilson's 95% interval over all episodes.
-    pub interval: Interval,
-    /// Mean of the entries' mean returns, each weighing as many episodes as it has.
-    pub return_mean: Option<f64>,
-    /// Success rate of each entry.
-    pub rates: Vec<f64>,
-    /// Their mean and standard deviation, from two on.
-    pub spread: Option<(f64, f64)>,
 }
 
 impl Measurement for Results {
@@ -89,11 +70,13 @@ impl Results {
             if source.files.contains(&known) {
                 return Err(wrong(format!("was given twice as {label:?}: its episodes would count twice")));
             }
+            let lay = file.of.as_deref().map(Path::to_string_lossy);
+            let policy = lay.as_ref().map_or_else(|| known.1.clone(), |lay| sha256_hex(lay.as_bytes()));
+            let of = lay.map_or_else(String::new, |lay| shown_path(&lay));
             source.files.push(known);
-            let of =
-                file.of.as_deref().map_or_else(String::new, |of: &Path| shown_path(&of.to_string_lossy()));
             entries.extend(file.tasks.into_iter().map(|report| ResultEntry {
                 label: label.clone(),
+                policy: policy.clone(),
                 of: of.clone(),
                 task: report.settings.task,
                 disturb: report.settings.disturb,
@@ -120,36 +103,36 @@ impl Results {
             let place = order.iter().position(|label| *label == entry.label).unwrap_or(0);
             groups.entry((&entry.task, &entry.disturb, place)).or_default().push(entry);
         }
-        groups.into_values().map(|entries| pool(&entries)).collect()
+        groups.into_values().map(|entries| pooled(&entries)).collect()
     }
 }
 
-fn pool(entries: &[&ResultEntry]) -> Pooled {
-    let (first, episodes) = (entries[0], entries.iter().map(|entry| entry.episodes).sum());
-    let successes = entries.iter().map(|entry| entry.successes).sum();
-    let returned: f64 = entries.iter().map(|entry| entry.return_mean * entry.episodes as f64).sum();
-    let rates: Vec<f64> =
-        entries.iter().map(|entry| entry.successes as f64 / entry.episodes.max(1) as f64).collect();
-    Pooled {
-        label: first.label.clone(),
-        task: first.task.clone(),
-        disturb: first.disturb.clone(),
-        episodes,
-        successes,
-        interval: wilson(successes, episodes),
-        return_mean: (episodes > 0).then(|| returned / episodes as f64),
-        spread: if rates.len() > 1 { mean_and_std(rates.iter().copied()) } else { None },
-        rates,
+/// Entries of one label on one task: first those of a policy are taken together, then the policies.
+fn pooled(entries: &[&ResultEntry]) -> Pooled {
+    let mut trainings: Vec<(&str, Training)> = Vec::new();
+    for entry in entries {
+        let found = Training::of(entry.successes, entry.episodes, entry.return_mean);
+        // Parts from before policies were told apart hold one file a training.
+        match trainings.iter_mut().find(|(policy, _)| !policy.is_empty() && *policy == entry.policy) {
+            Some((_, training)) => training.add(&found),
+            None => trainings.push((&entry.policy, found)),
+        }
     }
+    let trainings: Vec<Training> = trainings.into_iter().map(|(_, training)| training).collect();
+    let first = entries[0];
+    pool(&first.label, &first.task, &first.disturb, &trainings)
 }
 
 #[cfg(test)]
 mod tests {
     use super::*;
 
+    use crate::evaluation::Over;
+
     fn entry(label: &str, task: &str, successes: usize) -> ResultEntry {
         ResultEntry {
             label: label.into(),
+            policy: String::new(),
             of: String::new(),
             task: task.into(),
             disturb: "none".into(),
@@ -174,7 +157,23 @@ mod tests {
         assert_eq!(found, expected);
         assert_eq!((pooled[1].episodes, pooled[1].rates.clone()), (20, vec![0.8, 1.0]));
         assert_eq!((pooled[1].return_mean, pooled[0].spread), (Some(9.0), None));
-        assert_eq!(pooled[1].interval, wilson(18, 20));
+        let interval = pooled[1].interval;
+        assert_eq!((interval.low, interval.high), (0.8, 1.0), "over two seeds, not over twenty episodes");
+        assert_eq!((pooled[1].over, pooled[0].over), (Over::Seeds(2, 0), Over::Episodes));
+    }
+
+    #[test]
+    fn files_of_one_policy_are_one_training_however_many_layouts_it_was_run_on() {
+        let of = |policy: &str, successes| ResultEntry {
+            policy: policy.into(),
+            ..entry("a", "hammer", successes)
+        };
+        let entries = vec![of("x", 2), of("y", 9), of("x", 4)];
+        let pooled = Results { entries }.pooled();
+        assert_eq!(
+            (pooled[0].rates.clone(), pooled[0].episodes, pooled[0].over),
+            (vec![0.3, 0.9], 30, Over::Seeds(2, 0))
+        );
     }
 
     #[test]

@@ -10,7 +10,8 @@ use rcwm_models::settings::ModelSettings;
 use rcwm_models::tasks::task_id;
 use serde::{Deserialize, Serialize};
 
-use super::{Draft, Measurement, ReportError, shown_words};
+use super::pooled::{Pooled, Training, pool};
+use super::{Draft, Measurement, Part, ReportError, shown_words};
 use crate::evaluation::{
     ClosedLoopReport, ClosedLoopSettings, Interval, Position, closed_loop, recorded_episode,
 };
@@ -216,6 +217,55 @@ pub fn policies(folders: &[PathBuf]) -> Result<(Vec<Policy>, Vec<String>), Repor
         }
     }
     Ok((found, left_out))
+}
+
+/// Policies of one task that differ in their training seed only, taken together: of the same sizes and updates, where a seed comes twice
+/// also of the same data. Those that have no other beside them are left out.
+pub(super) fn over_seeds(parts: &[Part<Success>]) -> Vec<Pooled> {
+    let sizes = |a: &Success, b: &Success| {
+        let of = |x: &Success| (x.model.clone(), x.provenance.preset.clone(), x.provenance.updates);
+        of(a) == of(b)
+    };
+    let data = |a: &Success, b: &Success| a.provenance.data == b.provenance.data;
+    let repeated = |group: &[&Part<Success>]| {
+        let seeds: Vec<_> = group.iter().map(|part| &part.measured.provenance.seeds).collect();
+        seeds.iter().enumerate().any(|(place, seeds_of)| seeds[..place].contains(seeds_of))
+    };
+    let mut found = Vec::new();
+    for group in split(parts.iter(), sizes) {
+        let groups = if repeated(&group) { split(group.into_iter(), data) } else { vec![group] };
+        for group in groups.into_iter().filter(|group| group.len() > 1 && !repeated(group)) {
+            let trainings: Vec<Training> = group
+                .iter()
+                .map(|part| {
+                    Training::of(part.measured.successes, part.measured.episodes, part.measured.return_mean)
+                })
+                .collect();
+            let names: Vec<&str> = group.iter().map(|part| part.source.policy.as_str()).collect();
+            let source = &group[0].source;
+            found.push(pool(&names.join(", "), &source.task, &source.disturb, &trainings));
+        }
+    }
+    found
+}
+
+/// Parts on the same task that are alike, in the order of the first.
+fn split<'a>(
+    parts: impl Iterator<Item = &'a Part<Success>>,
+    alike: impl Fn(&Success, &Success) -> bool,
+) -> Vec<Vec<&'a Part<Success>>> {
+    let same = |a: &Part<Success>, b: &Part<Success>| {
+        (&a.source.task, &a.source.disturb) == (&b.source.task, &b.source.disturb)
+            && alike(&a.measured, &b.measured)
+    };
+    let mut groups: Vec<Vec<&Part<Success>>> = Vec::new();
+    for part in parts {
+        match groups.iter_mut().find(|group| same(group[0], part)) {
+            Some(group) => group.push(part),
+            None => groups.push(vec![part]),
+        }
+    }
+    groups
 }
 
 /// The folder itself if it is a bundle, else the bundles in it.

@@ -1,7 +1,7 @@
 use maud::{Markup, html};
 
-use super::plot;
-use crate::evaluation::{Measure, Series, TaskReport};
+use super::{plot, seeds};
+use crate::evaluation::{Measure, Series, Spread, TaskReport, Windows};
 use crate::report::html::{Column, nothing, table, words};
 use crate::report::page::Compared;
 use crate::report::{Dynamics, Part, Report, ReportError, UNDISTURBED};
@@ -18,12 +18,92 @@ pub(super) fn robot(report: &Report) -> Result<Markup, ReportError> {
         p {
             "A model sees " (first.source.settings.context) " steps of a trajectory and imagines " (first.source.settings.imagined)
             " more with the recorded actions. The error is " (Measure::RobotError.definition()) ". Curves are means over trajectories, \
-             bands one standard deviation."
+             bands one standard deviation. Windows: " (windows(first.source.settings.windows)) "."
         }
         (curves(&parts, Measure::RobotError)?)
         (errors(&parts))
+        (seeds::section(report, UNDISTURBED))
         (ratios(&compared))
     })
+}
+
+fn windows(windows: Windows) -> &'static str {
+    match windows {
+        Windows::Moving => {
+            "they end before the task is first solved, or where the model's steps end, and the robot moves at half of the imagined steps or more"
+        }
+        Windows::Anywhere => "anywhere in an episode, also where the robot holds still or after success",
+    }
+}
+
+/// Error on what moves but the robot, by kind of script.
+pub(super) fn scene(report: &Report) -> Result<Markup, ReportError> {
+    let parts = of(report, UNDISTURBED);
+    let known = |part: &&&Part<Dynamics>| part.measured.report.imagined.contains_key(&Measure::MovingError);
+    let parts: Vec<_> = parts.iter().filter(known).copied().collect();
+    if parts.is_empty() {
+        return Ok(nothing(HOW));
+    }
+    Ok(html! {
+        p { "The same imagined steps. Moving error: " (Measure::MovingError.definition()) "." }
+        p { "Change error: " (Measure::ChangeError.definition()) "." }
+        (curves(&parts, Measure::MovingError)?)
+        (by_kind(&parts))
+    })
+}
+
+/// Robot and scene by who decided in the episode.
+fn by_kind(parts: &[&Part<Dynamics>]) -> Markup {
+    let columns = [
+        Column::Words("task"),
+        Column::Words("model"),
+        Column::Words("script"),
+        Column::Number("windows (episodes)"),
+        Column::Number("robot error × 1000"),
+        Column::Number("95% interval"),
+        Column::Number("moving error × 1000"),
+        Column::Number("95% interval"),
+        Column::Number("change error (still = 1)"),
+        Column::Number("95% interval"),
+    ];
+    let mut rows = Vec::new();
+    for part in parts {
+        let report = &part.measured.report;
+        let all = |measure: Measure| {
+            let series = report.imagined.get(&measure)?;
+            Some(Spread { mean: series.mean, std: series.std, interval: series.interval })
+        };
+        let mut row = |kind: &str,
+                       windows: usize,
+                       episodes: usize,
+                       of: &dyn Fn(Measure) -> Option<Spread>| {
+            let mut row = vec![
+                words(&report.task),
+                words(&part.source.model),
+                words(kind),
+                words(format!("{windows} ({episodes})")),
+            ];
+            for (measure, scale) in Measure::COMPARED.into_iter().zip([1e3, 1e3, 1.0]) {
+                let found = of(measure);
+                row.push(found.and_then(|x| x.mean).and_then(|mean| words(format!("{:.3}", mean * scale))));
+                let range = found.and_then(|x| x.interval);
+                row.push(range.and_then(|i| words(format!("{:.3} to {:.3}", i.low * scale, i.high * scale))));
+            }
+            rows.push(row);
+        };
+        row("all", report.trajectories, report.episodes, &all);
+        for kind in &report.kinds {
+            row(&kind.kind, kind.trajectories, kind.episodes, &|measure| {
+                kind.imagined.get(&measure).copied()
+            });
+        }
+    }
+    html! {
+        (table(&columns, &rows))
+        p.soft {
+            "Missing: nothing but the robot moves in these windows, or they are of one episode, over which there is no interval."
+        }
+    }
 }
 
 /// Reconstruction and reward error over the imagined steps (paper, Fig. 7).
@@ -50,7 +130,8 @@ pub(super) fn strips(report: &Report) -> Result<Markup, ReportError> {
     }
     let mut figures = Vec::new();
     for part in parts {
-        for file in &part.pictures {
+        let is_strip = |(place, _): &(usize, _)| !part.measured.response_pictures.contains(place);
+        for (_, file) in part.pictures.iter().enumerate().filter(is_strip) {
             let title = format!("{}, {}", part.source.task, part.source.model);
             figures.push(html! {
                 h3 { (title) } figure { div.strip { (report.picture(file, "", &title)?) } }

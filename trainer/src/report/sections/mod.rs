@@ -5,7 +5,9 @@ mod disturbances;
 mod dynamics;
 mod learning;
 mod made;
+mod response;
 mod results;
+mod seeds;
 mod success;
 
 use image::RgbImage;
@@ -33,6 +35,8 @@ pub(super) fn all(report: &Report) -> Result<Vec<Section>, ReportError> {
     Ok(vec![
         section("success", "Success", success::section(report)?),
         section("dynamics", "Robot dynamics", dynamics::robot(report)?),
+        section("scene", "What else moves", dynamics::scene(report)?),
+        section("response", "Response to actions", response::section(report)?),
         section("imagination", "Imagination", dynamics::imagination(report)?),
         section("branches", "Both branches", dynamics::strips(report)?),
         section("attention", "Attention", attention::section(report)?),

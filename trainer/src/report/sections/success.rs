@@ -1,6 +1,7 @@
 use maud::{Markup, html};
 use rcwm_models::tasks::{DOWNSTREAM, UPSTREAM};
 
+use super::results::{compared, pooled};
 use crate::report::html::{Column, number, percent, percents, range, table, words};
 use crate::report::{Part, Report, ReportError, Success, UNDISTURBED};
 
@@ -35,6 +36,12 @@ pub(super) fn section(report: &Report) -> Result<Markup, ReportError> {
         h3 { "Upstream tasks" }
         (tasks(&parts, &UPSTREAM))
         @if !others.is_empty() { h3 { "Other tasks" } (tasks(&parts, &others)) }
+        @if !report.policies_over_seeds.0.is_empty() {
+            h3 { "Over training seeds" }
+            p.soft { "Policies that differ in the seed of their training only; intervals are bootstraps over trainings." }
+            (pooled(&report.policies_over_seeds.0))
+            (compared(&report.policies_over_seeds.1))
+        }
         (films(report, &parts)?)
     })
 }
