@@ -236,3 +236,43 @@ fn two_signals_at_once_are_one() {
     }
     assert_eq!(run.wait().unwrap().code(), Some(0));
 }
+
+/// Starts a run that is shown one observation, and ends it; gives what it has said.
+fn shown_one_observation(arguments: &[&str], before: impl FnOnce(&support::OwnLink)) -> (i32, String) {
+    let link = own_link();
+    before(&link);
+    let peer = link.peer();
+    let mut command = runtime();
+    command.env("RCWM_PREFIX", link.prefix()).args(["run", "--instance", "test", "--bundle"]);
+    command.arg(smallest_bundle()).args(arguments);
+    let run = std::thread::spawn(move || command.output().unwrap());
+    support::ask(&peer, &observation(0, 0));
+    peer.close().unwrap();
+    let output = run.join().unwrap();
+    (output.status.code().unwrap(), String::from_utf8(output.stderr).unwrap())
+}
+
+#[test]
+fn a_run_whose_swap_desk_is_taken_goes_on_without_swaps_and_says_so() {
+    use std::os::linux::net::SocketAddrExt;
+    use std::os::unix::net::{SocketAddr, UnixListener};
+    let mut taken = None;
+    let (code, said) = shown_one_observation(&[], |link| {
+        let name = rcwm_runtime::swap::name_of_desk(&link.0);
+        let address = SocketAddr::from_abstract_name(name).unwrap();
+        taken = Some(UnixListener::bind_addr(&address).unwrap());
+    });
+    let lines: Vec<_> = said.lines().filter(|line| line.contains("no swaps")).collect();
+    assert_eq!((code, lines.len()), (0, 1), "{said}");
+    assert!(lines[0].contains("another run with this instance"), "{said}");
+}
+
+#[test]
+fn a_run_that_records_says_that_it_takes_no_swaps_and_one_that_takes_them_does_not() {
+    let folder = tempfile::tempdir().unwrap();
+    let (code, said) = shown_one_observation(&["--record", folder.path().to_str().unwrap()], |_| {});
+    assert_eq!(code, 0, "{said}");
+    assert!(said.contains("no swaps") && said.contains("--record"), "{said}");
+    let (code, said) = shown_one_observation(&[], |_| {});
+    assert!(code == 0 && !said.contains("no swaps"), "{said}");
+}

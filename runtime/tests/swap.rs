@@ -12,18 +12,25 @@ use rcwm_models::bundle::PartName;
 use rcwm_models::wire::{ActionSource, ObservationFlags, SimulatorLink};
 use rcwm_runtime::controller::{Controller, Fallback, RunReport};
 use rcwm_runtime::policy::Sampling;
-use rcwm_runtime::swap::{Answer, SwapError, SwapSettings, Swapper, When, ask};
+use rcwm_runtime::swap::{Answer, SwapError, SwapSettings, Swapper, When, ask, name_of_desk};
 use rcwm_runtime::{EngineKind, EngineSettings, Policy};
-use support::{OwnLink, dividing_by_zero, own_link, smallest_bundle, with_manifest, with_nan_weight};
+use support::{
+    OwnLink, dividing_by_zero, own_link, smallest_bundle, too_small_for_16_bits, with_manifest,
+    with_nan_weight,
+};
 
 const EPISODE: u64 = 20;
 
 /// A controller that takes swaps; ends when the peer closes.
 fn start(link: &OwnLink) -> JoinHandle<RunReport> {
-    let policy = Policy::load(&smallest_bundle(), EngineSettings::tract()).unwrap();
+    start_on(link, EngineSettings::tract())
+}
+
+fn start_on(link: &OwnLink, engine: EngineSettings) -> JoinHandle<RunReport> {
+    let policy = Policy::load(&smallest_bundle(), engine).unwrap();
     let settings = SwapSettings {
         link: link.0.clone(),
-        engine: EngineSettings::tract(),
+        engine,
         sampling: Sampling::Mode,
         rate_hz: policy.manifest().control.rate_hz,
     };
@@ -153,6 +160,63 @@ fn a_bad_bundle_is_refused_with_one_line_and_the_old_one_runs_on() {
     peer.close().unwrap();
     let counters = controller.join().unwrap().counters;
     assert_eq!((counters.swaps, counters.fallback_answers), (0, 0));
+}
+
+#[test]
+fn a_bundle_is_verified_in_the_form_that_will_run() {
+    // Right in 32 bits, and zeros in 16.
+    let bundle = too_small_for_16_bits(PartName::Actor);
+    for (half_weights, accepted) in [(false, true), (true, false)] {
+        let link = own_link();
+        let peer = link.peer();
+        let controller = start_on(&link, EngineSettings::tract().with_half_weights(half_weights));
+        let mut peer_ticks = Peer { link: &peer, sequence: 0 };
+        peer_ticks.tick();
+        let sound = peer_ticks.tick_until(ask_aside(&link, &smallest_bundle(), When::Now)).unwrap();
+        assert!(matches!(sound, Answer::Taken { .. }), "16-bit weights {half_weights}: {sound:?}");
+        let answer = peer_ticks.tick_until(ask_aside(&link, bundle.path(), When::Now)).unwrap();
+        match answer {
+            Answer::Taken { .. } if accepted => {}
+            Answer::Refused { reason } if !accepted => assert!(reason.contains("16-bit weights"), "{reason}"),
+            other => panic!("16-bit weights {half_weights}: {other:?}"),
+        }
+        peer.close().unwrap();
+        controller.join().unwrap();
+    }
+}
+
+/// Makes the calling thread, and no other, one of this user.
+fn become_user(user: u32) {
+    // SAFETY: plain numbers; unlike the C library's function of this name the call is about one thread.
+    assert_eq!(unsafe { libc::syscall(libc::SYS_setresuid, user, user, user) }, 0);
+}
+
+#[test]
+fn nobody_asks_a_desk_of_a_stranger() {
+    use std::os::linux::net::SocketAddrExt;
+    use std::os::unix::net::{SocketAddr, UnixListener};
+    if !rustix::process::geteuid().is_root() {
+        eprintln!("left out: only root can act as two other users");
+        return;
+    }
+    let link = own_link();
+    let name = name_of_desk(&link.0);
+    let stranger = std::thread::spawn(move || {
+        become_user(65_533);
+        UnixListener::bind_addr(&SocketAddr::from_abstract_name(name).unwrap()).unwrap()
+    });
+    let listener = stranger.join().unwrap();
+    let settings = link.0.clone();
+    let asks = std::thread::spawn(move || {
+        become_user(65_534);
+        ask(&settings, Path::new("secret"), When::Now, None, &AtomicBool::new(false), &mut |_| {})
+    });
+    let error = asks.join().unwrap().unwrap_err();
+    assert!(matches!(error, SwapError::Stranger { user: 65_533, .. }), "{error:?}");
+    // Nothing was said.
+    listener.set_nonblocking(true).unwrap();
+    let (mut stream, _) = listener.accept().unwrap();
+    assert_eq!(std::io::Read::read(&mut stream, &mut [0; 64]).unwrap(), 0);
 }
 
 #[test]

@@ -182,14 +182,25 @@ fn read_manifest(path: &Path) -> Result<Manifest, BundleError> {
     struct Versioned {
         format: u32,
     }
-    let first_line = |error: toml::de::Error| wrong(error.to_string().trim().replace('\n', " "));
-    let Versioned { format } = toml::from_str(&text).map_err(first_line)?;
+    let not_understood = |error: toml::de::Error| wrong(said_of(&error, &text));
+    let Versioned { format } = toml::from_str(&text).map_err(not_understood)?;
     if format != FORMAT {
         return Err(BundleError::Format { found: format });
     }
-    let manifest: Manifest = toml::from_str(&text).map_err(first_line)?;
+    let manifest: Manifest = toml::from_str(&text).map_err(not_understood)?;
     manifest.check()?;
     Ok(manifest)
+}
+
+/// Line and reason, without the text around it: a line of a file from outside may be as long as the file.
+fn said_of(error: &toml::de::Error, text: &str) -> String {
+    const SHOWN_MAX: usize = 300;
+    let before = error.span().and_then(|span| text.as_bytes().get(..span.start));
+    let line = before.map(|before| 1 + before.iter().filter(|byte| **byte == b'\n').count());
+    let reason: String = error.message().split_whitespace().collect::<Vec<_>>().join(" ");
+    let shown: String = reason.chars().take(SHOWN_MAX).collect();
+    let cut = if shown.len() < reason.len() { " ..." } else { "" };
+    line.map_or_else(|| format!("{shown}{cut}"), |line| format!("line {line}: {shown}{cut}"))
 }
 
 impl Manifest {
@@ -360,4 +371,27 @@ fn read_initial(manifest: &Manifest, tensors: &Tensors) -> Result<InitialState, 
         environment_h: h("environment/h")?,
         environment_z: z("environment/z")?,
     })
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn said(text: &str) -> String {
+        said_of(&toml::from_str::<Manifest>(text).unwrap_err(), text)
+    }
+
+    #[test]
+    fn what_is_wrong_with_a_manifest_is_one_short_line_with_its_number() {
+        let text = said("format = 1\ntask = \"a\"\nother = 3\n");
+        assert!(text.starts_with("line 3: ") && text.contains("other"), "{text}");
+        for long in [
+            format!("x = {}", "[".repeat(50_000)),
+            format!("{}ü = 1", "k".repeat(50_000)),
+            "a.".repeat(50_000),
+        ] {
+            let text = said(&long);
+            assert!(text.len() < 700 && !text.contains('\n'), "{} bytes", text.len());
+        }
+    }
 }

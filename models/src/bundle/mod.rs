@@ -33,8 +33,8 @@ pub const MANIFEST_FILE: &str = "manifest.toml";
 pub const MANIFEST_BYTES_MAX: u64 = 1 << 17;
 /// Largest part accepted, in bytes; the paper's largest is about 25 MB.
 pub const PART_BYTES_MAX: u64 = 64 << 20;
-/// Most that all parts may hold together, in bytes; all of the paper's hold less than 100 MB. A part is in memory twice while it is
-/// checked, so that a bundle is refused with less than 256 MiB, whatever is in it.
-pub const PARTS_BYTES_MAX: u64 = 128 << 20;
+/// Most that all parts may hold together, in bytes; all of the paper's hold less than 100 MB. A part is in memory up to three times while
+/// it is decoded, so that a bundle is refused with less than 256 MiB, whatever is in it.
+pub const PARTS_BYTES_MAX: u64 = 100 << 20;
 /// Largest golden file accepted, in bytes.
 pub const GOLDEN_BYTES_MAX: u64 = 32 << 20;

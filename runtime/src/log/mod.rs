@@ -22,6 +22,9 @@ mod reader;
 mod record;
 mod replay;
 mod report;
+#[cfg(test)]
+#[allow(clippy::unwrap_used, reason = "a test that fails panics")]
+mod tests;
 mod worker;
 
 pub use episodes::{WrittenEpisodes, write_episodes};

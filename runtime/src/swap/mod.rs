@@ -24,6 +24,12 @@ mod message;
 mod prepare;
 mod priority;
 
+/// Name of the desk of a link: that of an abstract Unix socket.
+#[must_use]
+pub fn name_of_desk(link: &LinkSettings) -> String {
+    message::desk_name(link)
+}
+
 pub use handover::Moment;
 pub use message::{Answer, When, ask};
 
