@@ -7,7 +7,7 @@ mod support;
 use std::time::Duration;
 
 use rcwm_models::wire::Action;
-use rcwm_runtime::controller::{Counters, EpisodeResult, State, Tick, TickObserver, TickTimes};
+use rcwm_runtime::controller::{Counters, EpisodeResult, Episodes, State, Tick, TickObserver, TickTimes};
 use rcwm_runtime::log::{LogSettings, Logger};
 use rcwm_runtime::policy::Sampling;
 use rcwm_runtime::telemetry::{SnapshotSettings, Snapshots, Stage, Telemetry};
@@ -53,7 +53,7 @@ fn logging_and_snapshots_allocate_nothing_in_the_loop_s_thread() {
             policy: &policy,
             telemetry: &telemetry,
             counters: &counters,
-            episodes: &[],
+            episodes: &Episodes::default(),
             running: EpisodeResult::start(&observation),
         };
         let (count, ()) = allocations(|| {

@@ -6,8 +6,8 @@ use rcwm_models::settings::ModelKind;
 use serde::Serialize;
 
 use super::{
-    AttentionPart, Dynamics, Learning, LearningCurve, Made, Part, Pooled, ReportError, Results, Store, Success,
-    SuccessComparison, html, pooled, sections, success,
+    AttentionPart, Dynamics, Learning, LearningCurve, Made, Part, Pooled, ReportError, Results, Store,
+    Success, SuccessComparison, html, pooled, sections, success,
 };
 use crate::evaluation::{Comparison, OverSeeds, Trained};
 
