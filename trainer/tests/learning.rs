@@ -283,6 +283,33 @@ fn what_is_imitated_reaches_posteriors_and_encoders() {
     }
 }
 
+/// Threads share a batch by its rows, which differ in examples; one may have none.
+#[test]
+fn the_cloning_loss_is_the_mean_over_examples_however_they_are_shared_out() {
+    let model = ModelSettings::preset(Preset::Debug, ModelKind::Rcwm);
+    let parameters = lively_parameters(&model);
+    let mut learner =
+        WorldLearner::new(&parameters, &model, &WorldSettings::default(), Trained::World).unwrap();
+    learner.train(Trained::WorldAndActor, Some(IMITATION)).unwrap();
+    let (rows, steps) = (4, 5);
+    let mut batch = batch(rows, steps, false);
+    // The first row keeps all its examples, the second one, the others none.
+    batch.pushed = (0..rows * steps).map(|index| index >= steps + 2).collect();
+    let mean = learner.losses(&batch, &mut Sampler::seeded(4)).unwrap().values().unwrap().cloning.unwrap();
+    let (shared, gradients) = learner.gradients(&batch, &mut Sampler::seeded(4)).unwrap();
+    let shared = shared.values().unwrap().cloning.unwrap();
+    assert!(mean > 0.0 && (shared - mean).abs() < 1e-4 * mean, "{shared} in shares, {mean} in one");
+    let whole = learner.losses(&batch, &mut Sampler::seeded(4)).unwrap().total.backward().unwrap();
+    let name = "actor.out.weight";
+    let difference = (gradients.get(name).unwrap() - whole.get(parameters.get(name).unwrap()).unwrap()).unwrap();
+    let size = |x: &candle_core::Tensor| x.abs().unwrap().sum_all().unwrap().to_scalar::<f32>().unwrap();
+    assert!(size(&difference) < 1e-3 * size(gradients.get(name).unwrap()), "{}", size(&difference));
+    batch.pushed.fill(true);
+    let (none, gradients) = learner.gradients(&batch, &mut Sampler::seeded(4)).unwrap();
+    assert_eq!(none.values().unwrap().cloning, Some(0.0), "no example is no loss, not NaN");
+    assert!(gradients.norm().is_finite());
+}
+
 #[test]
 fn steps_that_are_painted_take_turns_and_cover_all() {
     let model = ModelSettings::preset(Preset::Debug, ModelKind::Rcwm);

@@ -3,7 +3,7 @@
 use rcwm_models::tasks::{OWN_TASK, task_name};
 use rcwm_models::wire::Observation;
 
-use crate::controller::Tick;
+use crate::controller::{Counters, Tick};
 
 /// Rates that differ by less are the same.
 const RATE_TOLERANCE: f64 = 0.01;
@@ -11,6 +11,8 @@ const RATE_TOLERANCE: f64 = 0.01;
 const SLOWER: f64 = 1.1;
 /// Observations of one episode from which the pace of a clock is told.
 const PACE_OBSERVATIONS: u64 = 20;
+/// One observation in so many may come late: that is a hiccup.
+const LATE_SHARE: u64 = 10;
 
 /// Looks at every observation; each remark is made once a policy.
 #[derive(Debug, Default)]
@@ -42,6 +44,7 @@ impl Remarks {
             }
             self.look(observation, &manifest.task, manifest.control.rate_hz);
         }
+        self.lateness(tick.counters);
         let new = self.told;
         self.told = self.made.len();
         &self.made[new..]
@@ -102,6 +105,23 @@ impl Remarks {
         self.first = Some(now);
     }
 
+    /// Whether observations come so late that they are dropped, or published long after they were due. Such ones may be all there are.
+    fn lateness(&mut self, counters: &Counters) {
+        let Counters { observations, stale_observations, published_late, .. } = *counters;
+        let late = stale_observations.saturating_add(published_late);
+        if self.period_ns == 0 || self.slow_told || observations < PACE_OBSERVATIONS {
+            return;
+        }
+        if late > observations / LATE_SHARE {
+            self.slow_told = true;
+            self.remark(format!(
+                "{late} of the first {observations} observations came long after they were due: the robot or simulator cannot keep \
+                 its rate of {:.1} Hz; lower it (rcwm-simulator serve --rate-hz)",
+                1e9 / self.period_ns as f64
+            ));
+        }
+    }
+
     /// The same is not said twice, as it would be of a robot that comes and goes.
     fn remark(&mut self, remark: String) {
         if !self.made.contains(&remark) {
@@ -149,6 +169,23 @@ mod tests {
         assert_eq!(made.len(), 2, "{made:?}");
         assert!(made[0].contains("task is reach") && made[0].contains("trained for hammer"), "{made:?}");
         assert!(made[1].contains("40.0 Hz") && made[1].contains("20.0 Hz"), "{made:?}");
+    }
+
+    #[test]
+    fn observations_that_come_long_after_they_were_due_are_remarked() {
+        let counters =
+            |stale_observations| Counters { observations: 100, stale_observations, ..Counters::default() };
+        let mut remarks = Remarks::default();
+        remarks.lateness(&counters(90));
+        assert_eq!(remarks.take(), Vec::<String>::new(), "lock-step has no clock");
+        remarks.look(&observation(0, 0), "reach", 40.0);
+        remarks.lateness(&counters(9));
+        assert_eq!(remarks.take(), Vec::<String>::new());
+        remarks.lateness(&counters(90));
+        remarks.lateness(&counters(95));
+        let made = remarks.take();
+        assert!(made.len() == 1 && made[0].contains("90 of the first 100"), "{made:?}");
+        assert!(made[0].contains("cannot keep"), "{made:?}");
     }
 
     #[test]

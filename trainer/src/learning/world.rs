@@ -109,15 +109,17 @@ impl WorldLearner {
     ) -> candle_core::Result<WorldLosses> {
         let mut losses = world_losses(&self.agent, batch, &self.settings, sampler)?;
         if let Some(imitation) = &self.imitation {
+            let features = losses.observed.posteriors.features()?; // [B, T, state width]
             let here = examples_a_row(batch);
-            let loss = if here > 0.0 {
-                let features = losses.observed.posteriors.features()?; // [B, T, state width]
+            let (features, actions, scale) = if here > 0.0 {
                 let (features, actions) = Examples::of_batch(&features, batch)?;
-                let mean = cloning_loss(&self.agent.actor, &features, &actions, imitation.loss)?;
-                (mean * (here / in_whole))?
+                (features, actions, here / in_whole)
             } else {
-                losses.total.zeros_like()?
+                // Rows without an example: the actor's gradient is there all the same, and zero.
+                let first = |x: &Tensor| x.flatten(0, 1)?.narrow(0, 0, 1);
+                (first(&features)?, first(&batch.action)?, 0.0)
             };
+            let loss = (cloning_loss(&self.agent.actor, &features, &actions, imitation.loss)? * scale)?;
             losses.total = (&losses.total + (&loss * imitation.scale)?)?;
             losses.cloning = Some(loss);
         }
