@@ -11,7 +11,7 @@ use std::thread::JoinHandle;
 
 use rcwm_models::episode::Episode;
 use rcwm_models::tasks::task_id;
-use rcwm_models::wire::{Observation, ObservationFlags};
+use rcwm_models::wire::{Observation, ObservationFlags, SimulatorLink};
 use support::{OwnLink, ask, observation, own_link, smallest_bundle};
 
 /// Standard output whose reader is gone.
@@ -45,8 +45,9 @@ struct Robot {
 impl Robot {
     fn playing(steps: u32, change: impl Fn(&mut Observation) + Send + 'static) -> Self {
         let link = own_link();
-        let peer = link.peer();
+        let settings = link.0.clone();
         let play = move || {
+            let peer = SimulatorLink::open(settings).unwrap();
             for step in 0..steps {
                 let mut sent = observation(u64::from(step), step);
                 sent.reward = 1.0;
