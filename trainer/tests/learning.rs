@@ -301,7 +301,8 @@ fn the_cloning_loss_is_the_mean_over_examples_however_they_are_shared_out() {
     assert!(mean > 0.0 && (shared - mean).abs() < 1e-4 * mean, "{shared} in shares, {mean} in one");
     let whole = learner.losses(&batch, &mut Sampler::seeded(4)).unwrap().total.backward().unwrap();
     let name = "actor.out.weight";
-    let difference = (gradients.get(name).unwrap() - whole.get(parameters.get(name).unwrap()).unwrap()).unwrap();
+    let difference =
+        (gradients.get(name).unwrap() - whole.get(parameters.get(name).unwrap()).unwrap()).unwrap();
     let size = |x: &candle_core::Tensor| x.abs().unwrap().sum_all().unwrap().to_scalar::<f32>().unwrap();
     assert!(size(&difference) < 1e-3 * size(gradients.get(name).unwrap()), "{}", size(&difference));
     batch.pushed.fill(true);

@@ -1,5 +1,6 @@
 use std::ops::Range;
 
+use candle_core::Tensor;
 use rcwm_models::settings::ModelSettings;
 
 use super::parts::part;
