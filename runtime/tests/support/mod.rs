@@ -97,28 +97,30 @@ pub fn dividing_by_zero(part: PartName) -> tempfile::TempDir {
     })
 }
 
-/// A bundle with a layer whose weights are 2^40 times as small as they were, and whose result is made that much larger again: the same in
-/// 32 bits, nothing but zeros in 16.
+/// A bundle with a layer whose weights are 2^30 times as small as they were, and whose result is made that much larger again, in two
+/// steps: the same in 32 bits, nothing but zeros in 16.
 pub fn too_small_for_16_bits(part: PartName) -> tempfile::TempDir {
-    const SCALE: f32 = (1_u64 << 40) as f32;
+    const STEP: f32 = (1 << 15) as f32;
     with_graph(part, |graph| {
         let layer = graph.node.iter().position(|node| node.op_type == "MatMul").unwrap();
         let (weight, output) = (graph.node[layer].input[1].clone(), graph.node[layer].output[0].clone());
         let tensor = graph.initializer.iter_mut().find(|tensor| tensor.name == weight).unwrap();
         for bytes in tensor.raw_data.as_chunks_mut::<4>().0 {
-            *bytes = (f32::from_le_bytes(*bytes) / SCALE).to_le_bytes();
+            *bytes = (f32::from_le_bytes(*bytes) / STEP / STEP).to_le_bytes();
         }
-        let scaled = format!("{output}_scaled");
-        graph.node[layer].output[0].clone_from(&scaled);
-        graph.initializer.push(Tensor::f32("large", &[1], &[SCALE]));
-        let back = Node {
-            op_type: "Mul".into(),
-            input: vec![scaled, "large".into()],
-            output: vec![output],
-            name: "large_again".into(),
-            ..Node::default()
-        };
-        graph.node.insert(layer + 1, back);
+        let [small, larger] = ["small", "larger"].map(|what| format!("{output}_{what}"));
+        graph.node[layer].output[0].clone_from(&small);
+        graph.initializer.push(Tensor::f32("step", &[1], &[STEP]));
+        for (place, from, to) in [(1, small, larger.clone()), (2, larger, output)] {
+            let back = Node {
+                op_type: "Mul".into(),
+                input: vec![from, "step".into()],
+                output: vec![to.clone()],
+                name: format!("makes_{to}"),
+                ..Node::default()
+            };
+            graph.node.insert(layer + place, back);
+        }
     })
 }
 
