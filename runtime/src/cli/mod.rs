@@ -78,7 +78,7 @@ const EXAMPLES: &str = "\
 Examples:
   rcwm-runtime inspect --bundle models/bundles/hammer
   rcwm-runtime verify --bundle models/bundles/hammer
-  rcwm-runtime run --bundle models/bundles/hammer --instance demo --record runs/demo --json runs/demo.json
+  rcwm-runtime run --bundle models/bundles/hammer --instance demo --record runs/demo
   rcwm-runtime swap --instance demo --bundle models/bundles/hammer --now
   rcwm-runtime bench --bundle models/bundles/hammer --engine all --ticks 2000
   rcwm-runtime replay --log runs/demo.rcwmlog --bundle models/bundles/hammer
