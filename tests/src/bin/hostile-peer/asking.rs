@@ -6,15 +6,18 @@ use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, Ordering};
 use std::sync::mpsc::{Receiver, RecvTimeoutError, channel};
 use std::thread::JoinHandle;
-use std::time::Duration;
+use std::time::{Duration, Instant};
 
 use rcwm_models::wire::LinkSettings;
 use rcwm_runtime::swap::{self, Answer};
+use rustix::process::{Pid, getpriority_process, setpriority_process};
 
 use crate::bundles::Known;
 
 /// How long preparing may take.
 const PREPARED_IN: Duration = Duration::from_secs(120);
+/// How often it is looked whether the bundle is ready.
+const LOOK: Duration = Duration::from_millis(20);
 /// From "ready" until the policy lies where the controller looks.
 const LAID_OUT_IN: Duration = Duration::from_millis(15);
 
@@ -67,10 +70,12 @@ impl Asking {
                 let _ = sender.send(answer.clone());
             });
         }));
+        let start = Instant::now();
         loop {
-            match answers.recv_timeout(PREPARED_IN) {
+            match answers.recv_timeout(LOOK) {
                 Ok(Answer::Loading) => {}
                 Ok(Answer::Ready { .. }) => break,
+                Err(RecvTimeoutError::Timeout) if start.elapsed() < PREPARED_IN => hasten(),
                 _ => return None,
             }
         }
@@ -125,5 +130,22 @@ impl Asking {
                     as u64;
         }
         self.taken
+    }
+}
+
+/// Takes the threads that load bundles out of the lowest priority, where that is allowed: the controller waits for them here, and a busy
+/// machine would take minutes.
+fn hasten() {
+    let (Ok(own), Ok(tasks)) = (getpriority_process(None), std::fs::read_dir("/proc/self/task")) else {
+        return;
+    };
+    for task in tasks.flatten() {
+        let is_swap =
+            std::fs::read_to_string(task.path().join("comm")).is_ok_and(|name| name.trim() == "swap");
+        let number = task.file_name().to_str().and_then(|name| name.parse().ok());
+        if let Some(thread) = number.filter(|_| is_swap).and_then(Pid::from_raw) {
+            // Who may not do that waits longer.
+            let _ = setpriority_process(Some(thread), own);
+        }
     }
 }

@@ -49,6 +49,15 @@ struct Newest {
     follows: bool,
     /// It came again and said something else, so that it is not known what is due.
     unclear: bool,
+    /// What was executed, as it said when it came again.
+    executed_again: Option<Vector>,
+}
+
+impl Newest {
+    /// It has no answer and may need none.
+    fn may_be_dropped(&self) -> bool {
+        self.borderline && self.answer.is_none()
+    }
 }
 
 /// A stand-in that is due.
@@ -71,6 +80,8 @@ pub(crate) struct Judge {
     /// The running bundle; two where a swap may or may not have happened.
     running: Vec<Known>,
     newest: Option<Newest>,
+    /// The one before, and whether its episode had begun: where the newest turned stale on the way, this one still is the newest.
+    previous: Option<(Newest, bool)>,
     last: Option<Action>,
     /// `last` belongs to the running episode.
     in_episode: bool,
@@ -100,6 +111,7 @@ impl Judge {
             setup,
             running: vec![running],
             newest: None,
+            previous: None,
             last: None,
             in_episode: false,
             is_held: false,
@@ -150,19 +162,26 @@ impl Judge {
         if heard.is_stale_at(heard.received_ns, self.setup.pacing.stale_periods) {
             return;
         }
+        let mut borderline = false;
         let begins = match &self.newest {
-            Some(Newest { heard: last, .. }) if last.publisher == heard.publisher => {
-                if heard.sequence < last.sequence {
-                    return;
-                }
-                if heard.sequence == last.sequence {
+            Some(newest) if newest.heard.publisher == heard.publisher => {
+                if heard.sequence == newest.heard.sequence {
                     self.received_again(&heard);
                     return;
                 }
-                heard.flags.contains(ObservationFlags::FIRST) || last.episode != heard.episode
+                let is_old = heard.sequence < newest.heard.sequence;
+                if is_old && !self.may_follow_previous(newest, &heard) {
+                    return;
+                }
+                borderline = is_old;
+                heard.flags.contains(ObservationFlags::FIRST) || newest.heard.episode != heard.episode
             }
             _ => true,
         };
+        match self.newest {
+            Some(newest) if newest.may_be_dropped() => {}
+            newest => self.previous = newest.map(|newest| (newest, self.in_episode)),
+        }
         if begins {
             self.in_episode = false;
         }
@@ -175,11 +194,19 @@ impl Judge {
             heard,
             answer: None,
             stand_ins: 0,
-            borderline: false,
+            borderline,
             swapped: false,
             follows,
             unclear: false,
+            executed_again: None,
         });
+    }
+
+    /// Whether a message that is older than the newest is newer than the one before, in case the newest was dropped.
+    fn may_follow_previous(&self, newest: &Newest, heard: &Heard) -> bool {
+        let follows =
+            |previous: &Heard| previous.publisher != heard.publisher || previous.sequence < heard.sequence;
+        newest.may_be_dropped() && self.previous.is_none_or(|(previous, _)| follows(&previous.heard))
     }
 
     fn received_again(&mut self, heard: &Heard) {
@@ -195,6 +222,7 @@ impl Judge {
         if newest.answer.is_none() {
             newest.borderline = true;
         }
+        newest.executed_again = Some(heard.executed).filter(|_| heard.is_executable());
         self.due = Due::default();
     }
 
@@ -286,7 +314,7 @@ impl Judge {
             return self.object("answers nothing", || format!("{action:?} before any message"));
         };
         self.turned_stale(seen_ns);
-        let newest = self.newest.unwrap_or(newest);
+        let newest = self.newest_for(action, source).unwrap_or(newest);
         self.bases = self.bases_of(&newest);
         self.before = self.last.filter(|_| self.in_episode);
         self.check_rate(action);
@@ -303,6 +331,21 @@ impl Judge {
         self.due = Due::default();
     }
 
+    /// The newest message when this was sent: the one before where the newest had turned stale on the way, and this is for none or for
+    /// another.
+    fn newest_for(&mut self, action: &Action, source: ActionSource) -> Option<Newest> {
+        let newest = self.newest?;
+        let for_it = action.answers == newest.heard.sequence && source != ActionSource::Imagined;
+        if newest.may_be_dropped()
+            && !for_it
+            && let Some((previous, in_episode)) = self.previous
+        {
+            self.in_episode = in_episode;
+            self.newest = Some(previous);
+        }
+        self.newest
+    }
+
     /// What the robot may have executed last: the rate limit counts from one of them, and holding means one of them.
     fn bases_of(&self, newest: &Newest) -> Vec<Vector> {
         let mut bases: Vec<Vector> = self.last.iter().map(|last| last.action).collect();
@@ -311,6 +354,7 @@ impl Judge {
         if newest.stand_ins == 0 && newest.heard.is_executable() {
             bases.push(newest.heard.executed);
         }
+        bases.extend(newest.executed_again);
         let rests = self.running.iter().any(|running| !running.is_absolute);
         if rests && starts && (newest.heard.flags.contains(ObservationFlags::FIRST) || bases.is_empty()) {
             bases.push([0.0; ACTION_LEN]);
@@ -341,20 +385,23 @@ impl Judge {
 
     /// Whether an action is what the filter makes of a target, from any base.
     fn is_made_of(&self, action: &Action, target: &Vector) -> bool {
-        let made = |limits: &ActionLimits, base: &Vector| {
-            let mut made = limits.clamp(*target);
-            if let Some(rate_max) = self.setup.rate_max {
-                // Near to what was sent last, too, where that is possible.
-                let last = self.before.map_or(*base, |before| before.action);
-                for near in [last, *base] {
-                    made = std::array::from_fn(|i| made[i].clamp(near[i] - rate_max, near[i] + rate_max));
-                }
+        let made = |limits: &ActionLimits, base: &Vector, i: usize| {
+            let wanted = target[i].clamp(limits.low[i], limits.high[i]);
+            let Some(rate_max) = self.setup.rate_max else { return wanted };
+            let near = |base: f32| (base - rate_max, base + rate_max);
+            let (mut low, mut high) = near(base[i]);
+            // Near to what was sent last, too, where that is possible.
+            let last = near(self.before.map_or(base[i], |before| before.action[i]));
+            if low.max(last.0) <= high.min(last.1) {
+                (low, high) = (low.max(last.0), high.min(last.1));
             }
-            limits.clamp(made)
+            wanted.clamp(low, high).clamp(limits.low[i], limits.high[i])
         };
-        let near = |(a, b): (&f32, &f32)| (a - b).abs() <= 1e-6 * (1.0 + b.abs());
-        let same = |made: Vector| made.iter().zip(&action.action).all(near);
-        let any = |running: &Known| self.bases.iter().any(|base| same(made(&running.limits, base)));
+        let near = |a: f32, b: f32| (a - b).abs() <= 1e-6 * (1.0 + b.abs());
+        let same = |limits: &ActionLimits, base: &Vector| {
+            (0..ACTION_LEN).all(|i| near(made(limits, base, i), action.action[i]))
+        };
+        let any = |running: &Known| self.bases.iter().any(|base| same(&running.limits, base));
         self.running.iter().any(any)
     }
 
@@ -412,13 +459,6 @@ impl Judge {
         seen_ns: u64,
     ) {
         let heard = newest.heard;
-        if newest.borderline && newest.answer.is_none() && source == ActionSource::Imagined {
-            // It had turned stale, and this stands in for it.
-            self.count(source);
-            (newest.follows, newest.unclear) = (false, true);
-            self.newest = Some(newest);
-            return;
-        }
         if let Some(first) = newest.answer {
             self.sent.repeated += 1;
             if source == ActionSource::Policy {
@@ -451,7 +491,8 @@ impl Judge {
         let may_fail = !is_sound || surprise.robot_max.is_some() || surprise.environment_max.is_some();
         let marked = match source {
             ActionSource::Policy => !unfit,
-            ActionSource::Fallback => unfit || may_fail,
+            // One that had turned stale may be stood in for.
+            ActionSource::Fallback => unfit || may_fail || newest.borderline,
             ActionSource::Imagined => false,
         };
         if !marked {
