@@ -195,17 +195,22 @@ fn what_cannot_be_written_hides_neither_how_the_run_ended_nor_what_else_failed()
     let peer = link.peer();
     let mut command = runtime();
     command.env("RCWM_PREFIX", link.prefix());
-    command.args(["run", "--instance", "test", "--silence-max", "0.3", "--json", "/dev/null/a.json"]);
-    command.args(["--plot", "/dev/null/a.png", "--bundle"]).arg(smallest_bundle());
+    let folder = tempfile::tempdir().unwrap();
+    command.args(["run", "--instance", "test", "--silence-max", "0.3"]);
+    command.arg("--json").arg(folder.path().join("a.json")).arg("--plot").arg(folder.path().join("a.png"));
+    command.arg("--bundle").arg(smallest_bundle());
     let answering = std::thread::spawn(move || command.assert().code(5).get_output().clone());
     while !peer.poll_events().unwrap().hello {
         std::thread::sleep(Duration::from_millis(5));
     }
+    // Both could be written when the run began.
+    let name = folder.path().file_name().unwrap().to_str().unwrap().to_owned();
+    folder.close().unwrap();
     peer.publish(|slot| *slot = observation(0, 0)).unwrap();
     let text = String::from_utf8(answering.join().unwrap().stderr).unwrap();
     let errors: Vec<_> = text.lines().filter(|line| line.starts_with("error: ")).collect();
     assert_eq!(errors.len(), 3, "{text}");
-    for part in ["has been silent", "/dev/null: ", "a.png"] {
+    for part in ["has been silent", &name, "a.png"] {
         assert!(errors.iter().any(|error| error.contains(part)), "{part}: {text}");
     }
 }
