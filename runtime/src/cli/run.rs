@@ -23,9 +23,10 @@ use crate::swap::{SwapSettings, Swapper};
 #[command(after_help = "Examples:\n  \
     rcwm-simulator serve --task reach --instance demo --episodes 3 &\n  \
     rcwm-runtime run --bundle models/bundles/hammer --instance demo --record runs/demo\n  \
-    rcwm-runtime run --bundle models/bundles/hammer --instance demo --log demo.rcwmlog --telemetry demo.jsonl\n  \
-    rcwm-runtime run --bundle DIR --instance arm --realtime --cpu 3 --fallback zero --rate-limit 0.2 \\\n    \
-    --surprise-robot-max 20\n\n\
+    rcwm-runtime run --bundle models/bundles/hammer --instance demo --log demo.rcwmlog \\\n    \
+    --telemetry demo.jsonl\n  \
+    rcwm-runtime run --bundle DIR --instance arm --realtime --cpu 3 --fallback zero \\\n    \
+    --rate-limit 0.2 --surprise-robot-max 20\n\n\
     Ends when the simulator says that it closes, after --episodes, or on Ctrl-C. A simulator that dies is waited for:\n\
     the run goes on with the next one on the instance. docs/controller.md draws what happens when.\n\n\
     Exit codes:\n  \

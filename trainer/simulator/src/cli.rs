@@ -37,7 +37,8 @@ Examples:
       the controller has said that it leaves: then the hand rests
   rcwm-simulator serve --task door-open --policy mixed --masks --episodes 16
       expert data with noise and robot masks for a recorder, which acknowledges each observation
-  rcwm-simulator serve --task hammer --policy expert --free-run --masks --episodes 1 --snapshot pictures
+  rcwm-simulator serve --task hammer --policy expert --free-run --masks --episodes 1 \\
+      --snapshot pictures
       pictures of one episode, without waiting for anybody";
 
 const TASKS_EXAMPLES: &str = "\

@@ -11,7 +11,8 @@ use rcwm_trainer::training::{Phase, Run, TrainingSettings, demonstrations};
 /// Write a bundle's card: what it learnt from, what that cost, how often it succeeds
 #[derive(Debug, clap::Args)]
 #[command(after_help = "Examples:
-  rcwm-trainer card --run runs/hammer --bundle bundles/hammer --success runs/hammer/success.json \\
+  rcwm-trainer card --run runs/hammer --bundle bundles/hammer \\
+      --success runs/hammer/success.json \\
       --film episode-0000.gif
 
 --success is what `evaluate --bundle BUNDLE --task TASK --json FILE` wrote. The card is README.md in

@@ -21,7 +21,8 @@ use super::bars;
   rcwm-trainer export --checkpoint runs/untrained --out bundles/untrained
   rcwm-trainer export --checkpoint runs/hammer --out bundles/hammer --task hammer --force
                       (a run's folder stands for its newest checkpoint)
-  rcwm-trainer export --checkpoint runs/small/checkpoints/last --form checkpoint --half --out models/small")]
+  rcwm-trainer export --checkpoint runs/small/checkpoints/last --form checkpoint --half \\
+      --out models/small")]
 pub struct Export {
     /// Folder of the checkpoint, or of a run: its newest one
     #[arg(long, value_name = "DIR")]
