@@ -254,7 +254,7 @@ fn a_request_that_is_not_understood_is_refused_and_the_next_is_served() {
     let link = own_link();
     let peer = link.peer();
     let controller = start(&link);
-    let name = format!("rcwm-swap/{}/{}", link.prefix(), link.0.instance);
+    let name = name_of_desk(&link.0);
     for words in
         [&b"please\n"[..], b"{\"version\":9,\"bundle\":\"x\",\"when\":\"now\"}\n", &[0xff; 100_000], b""]
     {

@@ -385,9 +385,11 @@ impl Pair {
         let mut command = Command::new(&programs.runtime);
         command
             .env("RCWM_PREFIX", &domain.prefix)
-            .args(["run", "--instance", &instance, "--engine", &settings.engine, "--timeout", SILENCE_S])
-            .args(["--seed", &settings.seed.to_string()])
-            .args(settings.sample.then_some("--sample"))
+            .args(["run", "--instance", &instance, "--engine", &settings.engine, "--timeout", SILENCE_S]);
+        if settings.sample {
+            command.args(["--sample", "--seed", &settings.seed.to_string()]);
+        }
+        command
             .arg("--bundle")
             .arg(place.bundle)
             .arg("--json")
