@@ -173,7 +173,7 @@ fn golden_values_can_come_from_a_recorded_episode() {
     let file = folder.path().join("episode.npz");
     let episode = Episode {
         image: Array4::from_shape_fn((4, 64, 64, 3), |(t, y, x, c)| (t * 40 + y + x + c) as u8),
-        action: Array2::from_elem((4, 4), 0.5),
+        action: Array2::from_shape_fn((4, 4), |(t, _)| if t == 0 { 0.0 } else { 0.5 }),
         ..Episode::blank(4)
     };
     episode.write(&file).unwrap();

@@ -214,5 +214,5 @@ fn a_folder_without_a_checkpoint_is_one_line_of_error() {
     let found = parameters_verb(&["--checkpoint".as_ref(), "/nowhere".as_ref()]);
     let error = String::from_utf8(found.stderr).unwrap();
     assert!(!found.status.success() && found.stdout.is_empty());
-    assert!(error.lines().count() == 1 && error.contains("/nowhere/checkpoint.toml"), "{error}");
+    assert!(error.lines().count() == 1 && error.contains("/nowhere: no such folder"), "{error}");
 }

@@ -208,6 +208,7 @@ fn few_shot_learning_that_was_interrupted_in_any_stage_gives_the_same_weights() 
         for stop in [2, 6, 12, 13, u64::MAX] {
             learn(&mut learning, stop);
             assert_eq!(learning.updates(), stop.min(20));
+            drop(learning);
             learning = Fewshot::resume(&parts, Run::settings(&parts).unwrap(), &Device::Cpu).unwrap();
         }
         assert!(

@@ -37,7 +37,7 @@ fn pixel(step: usize, at: usize) -> u8 {
 fn episode(steps: usize, success: bool) -> Episode {
     Episode {
         image: Array4::from_shape_fn((steps, 64, 64, 3), |(t, y, x, c)| pixel(t, (y * 64 + x) * 3 + c)),
-        action: Array2::from_elem((steps, 4), 0.25),
+        action: Array2::from_shape_fn((steps, 4), |(t, _)| if t == 0 { 0.0 } else { 0.25 }),
         reward: (0..steps).map(|t| t as f32 * 0.1).collect(),
         success: Array1::from_elem(steps, success),
         ..Episode::blank(steps)

@@ -24,7 +24,7 @@ fn episode(steps: usize, shift: usize, masked: bool) -> Episode {
             (steps, 64, 64, 3),
             |(t, y, x, _)| if inside(t, y, x) { 220 } else { 30 },
         ),
-        action: Array2::from_elem((steps, 4), 0.5),
+        action: Array2::from_shape_fn((steps, 4), |(t, _)| if t == 0 { 0.0 } else { 0.5 }),
         reward: (0..steps).map(|t| t as f32 * 0.1).collect(),
         robot_mask: masked.then(|| Array3::from_shape_fn((steps, 64, 64), |(t, y, x)| inside(t, y, x))),
         ..Episode::blank(steps)
@@ -168,6 +168,7 @@ fn without_an_average_a_checkpoint_holds_the_weights() {
     let stored = Checkpoint::read(&Run::last(folder.path()), &Device::Cpu).unwrap();
     assert!(bits(&stored.parameters) == bits(training.parameters()));
     // Whoever wants an average from now on gets one that begins here.
+    drop(training);
     let averaging = TrainingSettings { average_decay: 0.5, ..self::settings(ModelKind::Rcwm, 12) };
     let mut training = Pretraining::resume(folder.path(), averaging, &Device::Cpu).unwrap();
     train(&mut training);
@@ -183,6 +184,7 @@ fn a_run_that_died_after_a_checkpoint_repeats_what_was_lost() {
     train(&mut training);
     let mut first = Pretraining::create(&died, settings(ModelKind::Rcwm, 5), &Device::Cpu).unwrap();
     train(&mut first);
+    drop(first);
     // What a run that was killed two updates later leaves behind: metrics beyond the checkpoint, the last line cut off.
     let metrics = died.join("metrics.jsonl");
     let text = fs::read_to_string(&metrics).unwrap();
@@ -241,6 +243,7 @@ fn a_run_is_neither_overwritten_nor_resumed_where_there_is_none_or_with_another_
     train(&mut training);
     let again = Pretraining::create(folder.path(), settings(ModelKind::Rcwm, 1), &Device::Cpu);
     assert!(matches!(again, Err(TrainingError::Exists { .. })));
+    drop(training);
     let other = Pretraining::resume(folder.path(), settings(ModelKind::Vanilla, 1), &Device::Cpu);
     assert!(matches!(other, Err(TrainingError::OtherModel)));
 }

@@ -383,17 +383,19 @@ impl Pair {
             .arg(&served);
         let simulator = RunningProgram::start(Program::SIMULATOR, &instance, command)?;
         let mut command = Command::new(&programs.runtime);
-        command
-            .env("RCWM_PREFIX", &domain.prefix)
-            .args(["run", "--instance", &instance, "--engine", &settings.engine, "--timeout", SILENCE_S]);
+        command.env("RCWM_PREFIX", &domain.prefix).args([
+            "run",
+            "--instance",
+            &instance,
+            "--engine",
+            &settings.engine,
+            "--timeout",
+            SILENCE_S,
+        ]);
         if settings.sample {
             command.args(["--sample", "--seed", &settings.seed.to_string()]);
         }
-        command
-            .arg("--bundle")
-            .arg(place.bundle)
-            .arg("--json")
-            .arg(&ran);
+        command.arg("--bundle").arg(place.bundle).arg("--json").arg(&ran);
         if let Some(record) = place.record {
             command.arg("--record").arg(record);
         }

@@ -120,7 +120,9 @@ impl WorldLearner {
                 let first = |x: &Tensor| x.flatten(0, 1)?.narrow(0, 0, 1);
                 (first(&features)?, first(&batch.action)?, 0.0)
             };
-            let loss = (cloning_loss(&self.agent.actor, &features, &actions, imitation.loss)? * scale)?;
+            let loss = cloning_loss(&self.agent.actor, &features, &actions, imitation.loss)?;
+            // As a tensor: candle lets no gradient through a factor that is the number 0.
+            let loss = loss.mul(&Tensor::new(scale as f32, loss.device())?)?;
             losses.total = (&losses.total + (&loss * imitation.scale)?)?;
             losses.cloning = Some(loss);
         }
