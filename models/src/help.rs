@@ -25,9 +25,29 @@ fn words(line: &str) -> Vec<String> {
     words
 }
 
+/// What is wrong with the examples of `program` in help texts: those that `parse` refuses, and those that name a shipped file that is not
+/// there below `root`. Also how many there are.
+///
+/// # Errors
+/// The first example that is wrong, and why.
+pub fn check_examples(
+    texts: &[String],
+    program: &str,
+    root: &std::path::Path,
+    parse: impl Fn(&[String]) -> Result<(), String>,
+) -> Result<usize, String> {
+    let all: Vec<_> = texts.iter().flat_map(|text| examples(text, program)).collect();
+    for example in &all {
+        parse(example).map_err(|reason| format!("{example:?}: {reason}"))?;
+        if let Some(missing) = missing_file(example, root) {
+            return Err(format!("{example:?}: {missing} is not shipped"));
+        }
+    }
+    Ok(all.len())
+}
+
 /// The first path of an example that is said to be shipped, under `models/` or `tests/`, and is not there below `root`.
-#[must_use]
-pub fn missing_file(example: &[String], root: &std::path::Path) -> Option<String> {
+fn missing_file(example: &[String], root: &std::path::Path) -> Option<String> {
     let shipped = |word: &&String| word.starts_with("models/") || word.starts_with("tests/");
     let made = |index: usize| index > 0 && example[index - 1] == "--out";
     let paths = example.iter().enumerate().filter(|(index, word)| shipped(word) && !made(*index));
@@ -43,6 +63,20 @@ mod tests {
         let text = "Examples:\n  tool go --a 1 \\\n      --b \"x y=z\" &\n  other go\n  tool stop        (when it is enough)\n\nMore.";
         let expected = [vec!["tool", "go", "--a", "1", "--b", "x y=z"], vec!["tool", "stop"]];
         assert_eq!(examples(text, "tool"), expected);
+    }
+
+    #[test]
+    fn an_example_that_is_refused_or_names_what_is_not_there_is_told() {
+        let root = std::path::Path::new(env!("CARGO_MANIFEST_DIR")).join("..");
+        let check = |line: &str| {
+            let refuse = |example: &[String]| {
+                if example.contains(&"bad".to_owned()) { Err("bad".to_owned()) } else { Ok(()) }
+            };
+            check_examples(&[format!("Examples:\n  {line}\n")], "tool", &root, refuse)
+        };
+        assert_eq!(check("tool --bundle models/small"), Ok(1));
+        assert!(check("tool bad").unwrap_err().contains("bad"));
+        assert!(check("tool --bundle models/nothing").unwrap_err().contains("models/nothing is not shipped"));
     }
 
     #[test]

@@ -8,7 +8,6 @@ use std::sync::atomic::AtomicBool;
 use std::time::{Duration, Instant};
 
 use rcwm_models::bundle::{ActionMode, Bundle};
-use rcwm_models::wire::clock::monotonic_ns;
 use rcwm_models::wire::{ActionSource, Observation, SimulatorLink, Wait};
 use rcwm_runtime::controller::{
     Controller, ControllerError, ControllerSettings, Ended, Fallback, Tick, TickLimits, TickObserver,
@@ -17,20 +16,9 @@ use rcwm_runtime::policy::Sampling;
 use rcwm_runtime::swap::{self, Answer, SwapSettings, Swapper, When};
 use rcwm_runtime::{EngineKind, EngineSettings, Policy};
 use support::{
-    ask, observation, own_link, smallest_bundle, start_changed, start_controller_with, with_manifest,
+    NEVER, PERIOD_NS, ask, due_now, observation, own_link, smallest_bundle, start_changed,
+    start_controller_with, with_manifest,
 };
-
-/// Long enough for a busy machine to read each answer before the next.
-const PERIOD_NS: u64 = 200_000_000;
-/// Far longer than anything here takes.
-const NEVER: Duration = Duration::from_secs(20);
-
-/// An observation of a fixed clock, due now.
-fn due_now(sequence: u64) -> Observation {
-    let mut observation = observation(sequence, sequence as u32);
-    (observation.scheduled_ns, observation.period_ns) = (monotonic_ns(), PERIOD_NS);
-    observation
-}
 
 /// Publishes an observation of a fixed clock until it is answered, anew each time: one that a slow machine has made stale is not.
 fn ask_now(peer: &SimulatorLink, sequence: u64, change: impl Fn(&mut Observation)) {

@@ -7,23 +7,13 @@ mod support;
 use std::time::Duration;
 
 use rcwm_models::bundle::PartName;
-use rcwm_models::wire::clock::monotonic_ns;
-use rcwm_models::wire::{Action, ActionSource, Observation, ObservationFlags, SimulatorLink, Wait};
+use rcwm_models::wire::{Action, ActionSource, ObservationFlags, SimulatorLink, Wait};
 use rcwm_runtime::controller::{Cause, ControllerError, Ended, Fallback, State, SurpriseLimits, TickLimits};
 use rcwm_runtime::{EngineSettings, Policy};
-use support::{ask, dividing_by_zero, image, observation, own_link, smallest_bundle, start_controller_with};
-
-/// Long enough for a busy machine to read each answer before the next.
-const PERIOD_NS: u64 = 200_000_000;
-/// Far longer than anything here takes.
-const NEVER: Duration = Duration::from_secs(20);
-
-/// An observation of a fixed clock, due now.
-fn due_now(sequence: u64) -> Observation {
-    let mut observation = observation(sequence, sequence as u32);
-    (observation.scheduled_ns, observation.period_ns) = (monotonic_ns(), PERIOD_NS);
-    observation
-}
+use support::{
+    NEVER, PERIOD_NS, ask, dividing_by_zero, due_now, image, observation, own_link, smallest_bundle,
+    start_controller_with,
+};
 
 /// The next action that fits, whatever else comes before it.
 fn next(peer: &SimulatorLink, what: &str, fits: impl Fn(&Action) -> bool) -> Action {

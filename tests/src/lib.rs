@@ -3,6 +3,7 @@
 //!
 //! The binaries are those beside the test's own in the target folder; `make test` builds them first.
 
+pub mod campaign;
 pub mod faults;
 pub mod stream;
 

@@ -66,13 +66,16 @@ pub(super) fn ln<S: Simd>(simd: S, x: S::f32s) -> S::f32s {
 }
 
 #[cfg(test)]
-mod tests {
+pub(super) mod tests {
     use super::*;
-    use pulp::{Arch, WithSimd};
+    use pulp::WithSimd;
 
-    struct Each<'a, F>(&'a [f32], &'a mut [f32], F);
+    use super::super::not_finite::levels;
 
-    trait Function {
+    /// A function of every number of the first into the second; whole registers of them.
+    pub(in super::super) struct Each<'a, F>(pub &'a [f32], pub &'a mut [f32], pub F);
+
+    pub(in super::super) trait Function {
         fn at<S: Simd>(&self, simd: S, x: S::f32s) -> S::f32s;
     }
 
@@ -86,11 +89,11 @@ mod tests {
     }
 
     #[derive(Clone, Copy)]
-    struct Exp;
+    pub(in super::super) struct Exp;
     #[derive(Clone, Copy)]
-    struct Ln;
+    pub(in super::super) struct Ln;
     #[derive(Clone, Copy)]
-    struct Sigmoid;
+    pub(in super::super) struct Sigmoid;
 
     impl Function for Exp {
         fn at<S: Simd>(&self, simd: S, x: S::f32s) -> S::f32s {
@@ -111,7 +114,7 @@ mod tests {
     fn worst(function: impl Function + Copy, exact: fn(f64) -> f64, from: f32, to: f32) -> f64 {
         let x: Vec<f32> = (0..1 << 16).map(|i| from + (to - from) * i as f32 / 65_535.0).collect();
         let mut worst = 0.0_f64;
-        for arch in [Arch::new(), Arch::Scalar] {
+        for (_, arch) in levels() {
             let mut y = vec![0.0; x.len()];
             arch.dispatch(Each(&x, &mut y, function));
             for (x, y) in x.iter().zip(&y) {

@@ -1,10 +1,10 @@
 //! What is not finite never becomes finite, whatever instructions a kernel runs with: the checks behind a tick rest on it.
 
-use pulp::{Arch, Simd, WithSimd};
+use pulp::Arch;
 
 use super::conv::Conv;
 use super::latents::{divergence, log_probs};
-use super::math;
+use super::math::tests::{Each, Exp, Function, Ln, Sigmoid};
 use super::matrix::Matrix;
 use super::norm::Norm;
 use super::table::Table;
@@ -13,7 +13,7 @@ use super::weights::Precision;
 const BAD: [f32; 3] = [f32::NAN, f32::INFINITY, f32::NEG_INFINITY];
 
 /// Every level of instructions that this machine can run.
-fn levels() -> Vec<(&'static str, Arch)> {
+pub(super) fn levels() -> Vec<(&'static str, Arch)> {
     let mut levels = vec![("scalar", Arch::Scalar), ("best", Arch::new())];
     #[cfg(target_arch = "x86_64")]
     levels.extend(pulp::x86::V3::try_new().map(|simd| ("AVX2", Arch::V3(simd))));
@@ -44,52 +44,14 @@ fn assert_bad(out: &[f32], place: Option<usize>, what: &str) {
     assert_eq!(good, if place.is_some() { 0 } else { out.len() }, "{what}, {place:?}: {out:?}");
 }
 
-struct Map<'a, F>(&'a mut [f32], F);
-
-trait Function {
-    fn at<S: Simd>(&self, simd: S, x: S::f32s) -> S::f32s;
-}
-
-impl<F: Function> WithSimd for Map<'_, F> {
-    type Output = ();
-    fn with_simd<S: Simd>(self, simd: S) {
-        for x in S::as_mut_simd_f32s(self.0).0 {
-            *x = self.1.at(simd, *x);
-        }
-    }
-}
-
-#[derive(Clone, Copy)]
-struct Exp;
-#[derive(Clone, Copy)]
-struct Ln;
-#[derive(Clone, Copy)]
-struct Sigmoid;
-
-impl Function for Exp {
-    fn at<S: Simd>(&self, simd: S, x: S::f32s) -> S::f32s {
-        math::exp(simd, x)
-    }
-}
-impl Function for Ln {
-    fn at<S: Simd>(&self, simd: S, x: S::f32s) -> S::f32s {
-        math::ln(simd, x)
-    }
-}
-impl Function for Sigmoid {
-    fn at<S: Simd>(&self, simd: S, x: S::f32s) -> S::f32s {
-        math::sigmoid(simd, x)
-    }
-}
-
 #[test]
 fn functions_give_nothing_finite_of_what_is_not() {
     fn check<F: Function + Copy>(function: F, what: &str) {
         for (level, arch) in levels() {
             for bad in BAD {
-                let mut x = vec![bad; 64];
-                arch.dispatch(Map(&mut x, function));
-                assert_bad(&x, Some(0), &format!("{what}, {level}, {bad}"));
+                let mut y = vec![0.0; 64];
+                arch.dispatch(Each(&[bad; 64], &mut y, function));
+                assert_bad(&y, Some(0), &format!("{what}, {level}, {bad}"));
             }
         }
     }

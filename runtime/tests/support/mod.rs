@@ -16,15 +16,13 @@ use rcwm_models::bundle::{Bundle, MANIFEST_FILE, Manifest, PartName};
 use rcwm_models::files::sha256_hex;
 use rcwm_models::onnx::{Graph, Model, Node, Tensor, data_type};
 use rcwm_models::tensors::Values;
+use rcwm_models::wire::clock::monotonic_ns;
 use rcwm_models::wire::{
     Action, LinkSettings, Observation, ObservationFlags, SimulatorLink, Wait, forget_prefix,
 };
 use rcwm_runtime::controller::{Controller, ControllerError, ControllerSettings, Ended, Fallback, RunReport};
 use rcwm_runtime::record::{Recorded, Recorder};
 use rcwm_runtime::{EngineKind, EngineSettings, Policy};
-
-/// Far longer than anything here takes: reached only when an answer never comes.
-const NEVER: Duration = Duration::from_secs(20);
 
 /// The smallest bundle that is shipped.
 pub fn smallest_bundle() -> PathBuf {
@@ -122,6 +120,18 @@ pub fn too_small_for_16_bits(part: PartName) -> tempfile::TempDir {
             graph.node.insert(layer + place, back);
         }
     })
+}
+
+/// Long enough for a busy machine to read each answer before the next.
+pub const PERIOD_NS: u64 = 200_000_000;
+/// Far longer than anything here takes: reached only when an answer never comes.
+pub const NEVER: Duration = Duration::from_secs(20);
+
+/// An observation of a fixed clock, due now.
+pub fn due_now(sequence: u64) -> Observation {
+    let mut observation = observation(sequence, sequence as u32);
+    (observation.scheduled_ns, observation.period_ns) = (monotonic_ns(), PERIOD_NS);
+    observation
 }
 
 /// A link that no other test shares; nothing of it is left when this is dropped.

@@ -18,13 +18,13 @@ mod world;
 
 use std::path::PathBuf;
 use std::process::ExitCode;
-use std::sync::atomic::{AtomicBool, Ordering};
-use std::sync::{Arc, Mutex, PoisonError};
+use std::sync::atomic::Ordering;
+use std::sync::{Mutex, PoisonError};
 
 use anyhow::Context;
 use clap::Parser;
 use rcwm_models::wire::LinkSettings;
-use rcwm_tests::Domain;
+use rcwm_tests::{Domain, campaign};
 
 use bundles::Bundles;
 use judge::Violation;
@@ -79,16 +79,9 @@ fn main() -> ExitCode {
     let arguments = Arguments::parse();
     let done = match &arguments.keep {
         Some(numbers) => replay(&arguments, numbers),
-        None => campaign(&arguments),
+        None => run_seeds(&arguments),
     };
-    match done {
-        Ok(true) => ExitCode::SUCCESS,
-        Ok(false) => ExitCode::FAILURE,
-        Err(error) => {
-            eprintln!("error: {error:#}");
-            ExitCode::FAILURE
-        }
-    }
+    campaign::exit(done)
 }
 
 /// What every run needs.
@@ -173,15 +166,11 @@ fn replay(arguments: &Arguments, numbers: &str) -> anyhow::Result<bool> {
 }
 
 /// Run after run; true without a finding.
-fn campaign(arguments: &Arguments) -> anyhow::Result<bool> {
-    let stop = Arc::new(AtomicBool::new(false));
-    let flag = Arc::clone(&stop);
-    ctrlc::set_handler(move || flag.store(true, Ordering::Relaxed)).context("listening for Ctrl-C")?;
+fn run_seeds(arguments: &Arguments) -> anyhow::Result<bool> {
+    let stop = campaign::stop_on_ctrl_c()?;
     run::keep_panics();
     let bundles = Bundles::make(&arguments.bundle)?;
-    let bar = indicatif::ProgressBar::new(arguments.messages);
-    let style = "{wide_bar} {pos}/{len} messages {elapsed} eta {eta}";
-    bar.set_style(indicatif::ProgressStyle::with_template(style).context("the bar's template")?);
+    let bar = campaign::bar(arguments.messages, "{wide_bar} {pos}/{len} messages {elapsed} eta {eta}")?;
     let shared = Mutex::new(Report::new(arguments));
     let work = || -> anyhow::Result<()> {
         let domain = Domain::new();
@@ -208,19 +197,10 @@ fn campaign(arguments: &Arguments) -> anyhow::Result<bool> {
         anyhow::ensure!(left.is_empty(), "left in shared memory: {left:?}");
         Ok(())
     };
-    std::thread::scope(|scope| -> anyhow::Result<()> {
-        let threads: Vec<_> = (0..arguments.workers).map(|_| scope.spawn(work)).collect();
-        threads.into_iter().try_for_each(|thread| match thread.join() {
-            Ok(result) => result,
-            Err(_) => anyhow::bail!("a thread of the harness panicked"),
-        })
-    })?;
+    campaign::on_threads(arguments.workers.into(), work)?;
     bar.finish_and_clear();
     let report = shared.into_inner().unwrap_or_else(PoisonError::into_inner);
     print!("{}", report.text());
-    if let Some(path) = &arguments.json {
-        let json = serde_json::to_vec_pretty(&report).context("writing the report")?;
-        rcwm_models::files::write_atomic(path, &json)?;
-    }
+    campaign::write_json(arguments.json.as_deref(), &report)?;
     Ok(report.findings.is_empty())
 }

@@ -16,11 +16,11 @@ mod worker;
 
 use std::path::PathBuf;
 use std::process::ExitCode;
-use std::sync::atomic::{AtomicBool, Ordering};
-use std::sync::{Arc, Mutex, PoisonError};
+use std::sync::atomic::Ordering;
+use std::sync::{Mutex, PoisonError};
 
-use anyhow::Context;
 use clap::Parser;
+use rcwm_tests::campaign;
 
 use child::Child;
 use report::Report;
@@ -72,24 +72,13 @@ fn main() -> ExitCode {
     let arguments = Arguments::parse();
     let done =
         if arguments.worker { worker::serve(&arguments).map(|()| true) } else { supervise(&arguments) };
-    match done {
-        Ok(true) => ExitCode::SUCCESS,
-        Ok(false) => ExitCode::FAILURE,
-        Err(error) => {
-            eprintln!("error: {error:#}");
-            ExitCode::FAILURE
-        }
-    }
+    campaign::exit(done)
 }
 
 /// Hands out seeds to children; true without a finding.
 fn supervise(arguments: &Arguments) -> anyhow::Result<bool> {
-    let stop = Arc::new(AtomicBool::new(false));
-    let flag = Arc::clone(&stop);
-    ctrlc::set_handler(move || flag.store(true, Ordering::Relaxed)).context("listening for Ctrl-C")?;
-    let bar = indicatif::ProgressBar::new(arguments.count);
-    let style = "{msg} {wide_bar} {pos}/{len} {elapsed} eta {eta}";
-    bar.set_style(indicatif::ProgressStyle::with_template(style).context("the bar's template")?);
+    let stop = campaign::stop_on_ctrl_c()?;
+    let bar = campaign::bar(arguments.count, "{msg} {wide_bar} {pos}/{len} {elapsed} eta {eta}")?;
     let shared = Mutex::new(Report::new(arguments));
     let work = || -> anyhow::Result<()> {
         let mut child = Child::start(arguments)?;
@@ -103,19 +92,10 @@ fn supervise(arguments: &Arguments) -> anyhow::Result<bool> {
             bar.inc(1);
         }
     };
-    std::thread::scope(|scope| -> anyhow::Result<()> {
-        let threads: Vec<_> = (0..arguments.workers).map(|_| scope.spawn(work)).collect();
-        threads.into_iter().try_for_each(|thread| match thread.join() {
-            Ok(result) => result,
-            Err(_) => anyhow::bail!("a supervising thread panicked"),
-        })
-    })?;
+    campaign::on_threads(arguments.workers.into(), work)?;
     bar.finish_and_clear();
     let report = shared.into_inner().unwrap_or_else(PoisonError::into_inner);
     print!("{}", report.text());
-    if let Some(path) = &arguments.json {
-        let json = serde_json::to_vec_pretty(&report).context("writing the report")?;
-        rcwm_models::files::write_atomic(path, &json)?;
-    }
+    campaign::write_json(arguments.json.as_deref(), &report)?;
     Ok(report.findings.is_empty())
 }

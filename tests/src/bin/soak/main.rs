@@ -12,15 +12,15 @@ mod samples;
 use std::path::{Path, PathBuf};
 use std::process::{Child, Command, ExitCode, Stdio};
 use std::sync::atomic::{AtomicBool, AtomicUsize, Ordering};
-use std::sync::{Arc, Mutex, PoisonError};
+use std::sync::{Mutex, PoisonError};
 use std::time::{Duration, Instant};
 
 use anyhow::Context;
 use clap::Parser;
 use rcwm_models::bundle::Bundle;
-use rcwm_models::files::write_atomic;
 use rcwm_models::wire::{LinkSettings, SimulatorLink, forget_prefix, list_leftovers};
 use rcwm_runtime::swap::{Answer, When, ask};
+use rcwm_tests::campaign;
 use rcwm_tests::stream::Stream;
 
 use report::{Report, TENTHS};
@@ -88,20 +88,11 @@ fn positive(text: &str) -> Result<f64, String> {
 }
 
 fn main() -> ExitCode {
-    match run(&Arguments::parse()) {
-        Ok(true) => ExitCode::SUCCESS,
-        Ok(false) => ExitCode::FAILURE,
-        Err(error) => {
-            eprintln!("error: {error:#}");
-            ExitCode::FAILURE
-        }
-    }
+    campaign::exit(run(&Arguments::parse()))
 }
 
 fn run(arguments: &Arguments) -> anyhow::Result<bool> {
-    let stop = Arc::new(AtomicBool::new(false));
-    let flag = Arc::clone(&stop);
-    ctrlc::set_handler(move || flag.store(true, Ordering::Relaxed)).context("listening for Ctrl-C")?;
+    let stop = campaign::stop_on_ctrl_c()?;
     let prefix = format!("rcwm_soak{}_", std::process::id());
     let link = LinkSettings { prefix: Some(prefix.clone()), ..LinkSettings::new("soak") };
     let temporary = tempfile::tempdir()?;
@@ -138,13 +129,8 @@ fn run(arguments: &Arguments) -> anyhow::Result<bool> {
     report.leftovers = list_leftovers(&prefix)?;
     forget_prefix(&prefix);
     print!("{}", report.text());
-    write(arguments, &report)?;
+    campaign::write_json(arguments.json.as_deref(), &report)?;
     Ok(report.passes())
-}
-
-fn write(arguments: &Arguments, report: &Report) -> anyhow::Result<()> {
-    let Some(path) = &arguments.json else { return Ok(()) };
-    Ok(write_atomic(path, &serde_json::to_vec_pretty(report)?)?)
 }
 
 /// The run, killed where it still runs when this is dropped.
@@ -216,7 +202,7 @@ impl Clock<'_> {
             if elapsed >= next_report {
                 let report = self.report();
                 println!("{}", report.line(elapsed));
-                write(self.arguments, &report)?;
+                campaign::write_json(self.arguments.json.as_deref(), &*report)?;
                 next_report += REPORT;
             }
             std::thread::sleep(LOOK.min(every));

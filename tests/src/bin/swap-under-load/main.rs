@@ -8,7 +8,6 @@ mod bad;
 
 use std::path::{Path, PathBuf};
 use std::process::{Child, Command, ExitCode, Stdio};
-use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, AtomicUsize, Ordering};
 use std::time::{Duration, Instant};
 
@@ -17,6 +16,7 @@ use clap::Parser;
 use rcwm_models::bundle::Bundle;
 use rcwm_models::wire::{LinkSettings, SimulatorLink, forget_prefix, list_leftovers};
 use rcwm_runtime::swap::{Answer, When, ask};
+use rcwm_tests::campaign;
 use rcwm_tests::stream::{PhaseReport, Stream};
 use serde::Serialize;
 
@@ -89,20 +89,11 @@ struct Report {
 }
 
 fn main() -> ExitCode {
-    match run(&Arguments::parse()) {
-        Ok(true) => ExitCode::SUCCESS,
-        Ok(false) => ExitCode::FAILURE,
-        Err(error) => {
-            eprintln!("error: {error:#}");
-            ExitCode::FAILURE
-        }
-    }
+    campaign::exit(run(&Arguments::parse()))
 }
 
 fn run(arguments: &Arguments) -> anyhow::Result<bool> {
-    let stop = Arc::new(AtomicBool::new(false));
-    let flag = Arc::clone(&stop);
-    ctrlc::set_handler(move || flag.store(true, Ordering::Relaxed)).context("listening for Ctrl-C")?;
+    let stop = campaign::stop_on_ctrl_c()?;
     let prefix = format!("rcwm_load{}_", std::process::id());
     let link = LinkSettings { prefix: Some(prefix.clone()), ..LinkSettings::new("swap") };
     let folder = tempfile::tempdir()?;
@@ -131,9 +122,7 @@ fn run(arguments: &Arguments) -> anyhow::Result<bool> {
     forget_prefix(&prefix);
     let report = Report { rate_hz: arguments.rate_hz, phases, swaps, run, leftovers };
     print!("{}", report.text());
-    if let Some(path) = &arguments.json {
-        rcwm_models::files::write_atomic(path, &serde_json::to_vec_pretty(&report)?)?;
-    }
+    campaign::write_json(arguments.json.as_deref(), &report)?;
     Ok(report.swaps.wrong.is_empty() && report.swaps.taken == arguments.swaps)
 }
 
