@@ -14,7 +14,7 @@ pub const HELPER_NAME: &str = "rcwm-tick";
 /// Spins between two looks at the clock.
 const SPINS: u32 = 64;
 /// The helper is late when it was waited for at least so long: two cores are seldom equally fast.
-pub const PATIENCE_MIN: Duration = Duration::from_micros(15);
+pub const TIMEOUT_MIN: Duration = Duration::from_micros(15);
 
 /// What the helper can be sent to do.
 pub trait Job: Send + Sync {

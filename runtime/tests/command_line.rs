@@ -258,12 +258,12 @@ fn shown_one_observation(arguments: &[&str], before: impl FnOnce(&support::OwnLi
 }
 
 #[test]
-fn a_run_whose_swap_desk_is_taken_goes_on_without_swaps_and_says_so() {
+fn a_run_whose_swap_server_is_taken_goes_on_without_swaps_and_says_so() {
     use std::os::linux::net::SocketAddrExt;
     use std::os::unix::net::{SocketAddr, UnixListener};
     let mut taken = None;
     let (code, said) = shown_one_observation(&[], |link| {
-        let name = rcwm_runtime::swap::name_of_desk(&link.0);
+        let name = rcwm_runtime::swap::name_of_server(&link.0);
         let address = SocketAddr::from_abstract_name(name).unwrap();
         taken = Some(UnixListener::bind_addr(&address).unwrap());
     });

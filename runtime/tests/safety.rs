@@ -291,10 +291,10 @@ fn limits_are_last_right_after_a_swap_under_a_rate_limit() {
     let peer = link.peer();
     let policy = Policy::load(&smallest_bundle(), EngineSettings::tract()).unwrap();
     let (engine, rate_hz) = (EngineSettings::tract(), policy.manifest().control.rate_hz);
-    let desk = SwapSettings { link: link.0.clone(), engine, sampling: Sampling::Mode, rate_hz };
+    let server = SwapSettings { link: link.0.clone(), engine, sampling: Sampling::Mode, rate_hz };
     let limit = |settings: &mut ControllerSettings| settings.rate_max = Some(0.05);
     let controller = start_changed(policy, &link, limit, move |controller| {
-        controller.take_swaps(Swapper::start(desk).unwrap());
+        controller.take_swaps(Swapper::start(server).unwrap());
         let ended = controller.run(&AtomicBool::new(false), &mut []).unwrap();
         controller.report(EngineKind::Tract, ended)
     });

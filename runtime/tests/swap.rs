@@ -12,7 +12,7 @@ use rcwm_models::bundle::PartName;
 use rcwm_models::wire::{ActionSource, ObservationFlags, SimulatorLink};
 use rcwm_runtime::controller::{Controller, Fallback, RunReport};
 use rcwm_runtime::policy::Sampling;
-use rcwm_runtime::swap::{Answer, SwapError, SwapSettings, Swapper, When, ask, name_of_desk};
+use rcwm_runtime::swap::{Answer, SwapError, SwapSettings, Swapper, When, ask, name_of_server};
 use rcwm_runtime::{EngineKind, EngineSettings, Policy};
 use support::{
     OwnLink, dividing_by_zero, own_link, smallest_bundle, too_small_for_16_bits, with_manifest,
@@ -192,7 +192,7 @@ fn become_user(user: u32) {
 }
 
 #[test]
-fn nobody_asks_a_desk_of_a_stranger() {
+fn nobody_asks_a_server_of_a_stranger() {
     use std::os::linux::net::SocketAddrExt;
     use std::os::unix::net::{SocketAddr, UnixListener};
     if !rustix::process::geteuid().is_root() {
@@ -200,7 +200,7 @@ fn nobody_asks_a_desk_of_a_stranger() {
         return;
     }
     let link = own_link();
-    let name = name_of_desk(&link.0);
+    let name = name_of_server(&link.0);
     let stranger = std::thread::spawn(move || {
         become_user(65_533);
         UnixListener::bind_addr(&SocketAddr::from_abstract_name(name).unwrap()).unwrap()
@@ -238,7 +238,7 @@ fn a_bundle_is_withdrawn_when_the_one_who_asked_leaves() {
 }
 
 #[test]
-fn nobody_at_the_desk_is_one_line_that_says_what_to_do() {
+fn nobody_at_the_server_is_one_line_that_says_what_to_do() {
     let link = own_link();
     let stop = AtomicBool::new(false);
     let error = ask(&link.0, &smallest_bundle(), When::Now, None, &stop, &mut |_| {}).unwrap_err();
@@ -254,13 +254,13 @@ fn a_request_that_is_not_understood_is_refused_and_the_next_is_served() {
     let link = own_link();
     let peer = link.peer();
     let controller = start(&link);
-    let name = name_of_desk(&link.0);
+    let name = name_of_server(&link.0);
     for words in
         [&b"please\n"[..], b"{\"version\":9,\"bundle\":\"x\",\"when\":\"now\"}\n", &[0xff; 100_000], b""]
     {
         let address = SocketAddr::from_abstract_name(&name).unwrap();
         let mut stream = UnixStream::connect_addr(&address).unwrap();
-        // The desk may hang up before it has heard all of it.
+        // The server may hang up before it has heard all of it.
         let _ = stream.write_all(words).and_then(|()| stream.shutdown(std::net::Shutdown::Write));
         let mut answer = Vec::new();
         let _ = stream.read_to_end(&mut answer);

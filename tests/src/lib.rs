@@ -17,7 +17,7 @@ use iceoryx2::prelude::*;
 use rcwm_models::wire::{LinkSettings, Observation, ObserverLink, Wait, forget_prefix, list_leftovers};
 
 /// How long anything in a test may take before it counts as hung.
-pub const PATIENCE: Duration = Duration::from_secs(120);
+pub const TIMEOUT: Duration = Duration::from_secs(120);
 
 /// The root of the repository.
 #[must_use]
@@ -203,16 +203,16 @@ impl Running {
     /// Waits for its end.
     ///
     /// # Panics
-    /// When it has not ended within [`PATIENCE`].
+    /// When it has not ended within [`TIMEOUT`].
     pub fn end(&mut self) -> ExitStatus {
         let start = Instant::now();
-        while start.elapsed() < PATIENCE {
+        while start.elapsed() < TIMEOUT {
             if let Some(status) = self.child.try_wait().expect("its state is known") {
                 return status;
             }
             std::thread::sleep(Duration::from_millis(5));
         }
-        panic!("{} still runs after {PATIENCE:?}; it printed:\n{}", self.name, self.printed());
+        panic!("{} still runs after {TIMEOUT:?}; it printed:\n{}", self.name, self.printed());
     }
 
     /// Waits for its end, which must be a success.
@@ -247,11 +247,11 @@ pub fn output(mut command: Command) -> Output {
 /// Waits until `condition` holds.
 ///
 /// # Panics
-/// When it does not within [`PATIENCE`].
+/// When it does not within [`TIMEOUT`].
 pub fn eventually(what: &str, mut condition: impl FnMut() -> bool) {
     let start = Instant::now();
     while !condition() {
-        assert!(start.elapsed() < PATIENCE, "{what}: not within {PATIENCE:?}");
+        assert!(start.elapsed() < TIMEOUT, "{what}: not within {TIMEOUT:?}");
         std::thread::sleep(Duration::from_millis(2));
     }
 }
@@ -282,17 +282,17 @@ impl Observer {
     /// Waits for an observation that fits, and gives its sequence.
     ///
     /// # Panics
-    /// When none comes within [`PATIENCE`].
+    /// When none comes within [`TIMEOUT`].
     pub fn wait_for(&self, mut fits: impl FnMut(&Observation) -> bool) -> u64 {
         let start = Instant::now();
-        while start.elapsed() < PATIENCE {
+        while start.elapsed() < TIMEOUT {
             let wait = self.0.wait_observation(Duration::from_millis(100)).expect("the link works");
             match wait {
                 Wait::Message(sample) if fits(sample.payload()) => return sample.payload().sequence,
                 _ => {}
             }
         }
-        panic!("no fitting observation within {PATIENCE:?}");
+        panic!("no fitting observation within {TIMEOUT:?}");
     }
 }
 

@@ -159,7 +159,7 @@ pub fn main() -> ExitCode {
             Exit::from(&error) as u8
         }
     };
-    if crate::swap::desk_is_left() {
+    if crate::swap::server_is_left() {
         // SAFETY: ends the process; nothing of it is used afterwards.
         unsafe { libc::_exit(i32::from(code)) }
     }

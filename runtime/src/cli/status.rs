@@ -15,7 +15,7 @@ const UPDATE: Duration = Duration::from_millis(200);
 /// Messages that wait to be drawn; a terminal that does not drain loses those beyond.
 const WAITING_MAX: usize = 256;
 /// How long the end of a run waits for a terminal.
-const PATIENCE: Duration = Duration::from_secs(1);
+const TIMEOUT: Duration = Duration::from_secs(1);
 
 enum Message {
     Status(String),
@@ -110,7 +110,7 @@ impl Drop for StatusLine {
         self.messages = None;
         let Some(thread) = self.thread.take() else { return };
         let start = Instant::now();
-        while !thread.is_finished() && start.elapsed() < PATIENCE {
+        while !thread.is_finished() && start.elapsed() < TIMEOUT {
             std::thread::sleep(Duration::from_millis(2));
         }
         // One that a terminal holds up ends with the process. One that panicked while drawing has nothing left to clear.

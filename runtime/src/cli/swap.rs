@@ -54,12 +54,12 @@ pub(super) fn run(arguments: &SwapArguments) -> anyhow::Result<()> {
     let stop = super::stop_flag()?;
     let SwapArguments { instance, bundle, now, timeout, json } = arguments;
     let when = if *now { When::Now } else { When::Episode };
-    let patience = (*timeout > 0.0).then(|| Duration::from_secs_f64(*timeout));
+    let timeout = (*timeout > 0.0).then(|| Duration::from_secs_f64(*timeout));
     let bar = indicatif::ProgressBar::new_spinner().with_message("asking");
     bar.enable_steady_tick(Duration::from_millis(200));
     let (start, mut ready_s) = (Instant::now(), None);
     let answer =
-        ask(&LinkSettings::new(instance), bundle, when, patience, &stop, &mut |answer| match answer {
+        ask(&LinkSettings::new(instance), bundle, when, timeout, &stop, &mut |answer| match answer {
             Answer::Loading => bar.set_message("the run loads and verifies the bundle"),
             Answer::Ready { prepared_s } => {
                 ready_s = Some(*prepared_s);

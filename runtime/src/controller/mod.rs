@@ -198,7 +198,7 @@ impl Controller {
         }
     }
 
-    /// Takes over policies that are ready at a swap desk.
+    /// Takes over policies that are ready at a swap server.
     pub fn take_swaps(&mut self, swapper: Swapper) {
         self.swapper = Some(swapper);
     }

@@ -6,7 +6,7 @@ use tract_onnx::tract_hir::internal::*;
 
 use super::SharedTeam;
 use super::memory::Results;
-use super::shared::Lane;
+use super::shared::WorkerSlot;
 
 /// The arithmetic of an operator.
 pub(super) trait Compute: std::fmt::Debug + Send + Sync + 'static {
@@ -110,15 +110,15 @@ struct OwnState<C: Compute> {
     op: Own<C>,
     /// More than one only where another thread may still read the last.
     scratch: Vec<Arc<C::Scratch>>,
-    lane: Option<Arc<Lane<C>>>,
+    slot: Option<Arc<WorkerSlot<C>>>,
     results: Results,
 }
 
 impl<C: Compute> OwnState<C> {
     fn new(op: &Own<C>, results: Results) -> Self {
         let scratch = (0..1 + usize::from(op.1.is_some())).map(|_| Arc::new(op.0.scratch())).collect();
-        let lane = op.1.is_some().then(|| Lane::new(&op.0));
-        Self { op: op.clone(), scratch, lane, results }
+        let slot = op.1.is_some().then(|| WorkerSlot::new(&op.0));
+        Self { op: op.clone(), scratch, slot, results }
     }
 }
 
@@ -130,7 +130,7 @@ impl<C: Compute> Clone for OwnState<C> {
 
 impl<C: Compute> OpState for OwnState<C> {
     fn eval(&mut self, _: &EvalContext<'_>, _: &dyn Op, inputs: TVec<TValue>) -> TractResult<TVec<TValue>> {
-        let Self { op: Own(compute, team), scratch, lane, results } = self;
+        let Self { op: Own(compute, team), scratch, slot, results } = self;
         let free = scratch.iter_mut().position(|scratch| Arc::get_mut(scratch).is_some());
         let index = free.unwrap_or_else(|| {
             scratch.push(Arc::new(compute.scratch()));
@@ -141,8 +141,8 @@ impl<C: Compute> OpState for OwnState<C> {
         }
         let scratch = &scratch[index];
         results.write(|out| {
-            match (team, lane) {
-                (Some(team), Some(lane)) => lane.fill(team, &inputs, scratch, out)?,
+            match (team, slot) {
+                (Some(team), Some(slot)) => slot.fill(team, &inputs, scratch, out)?,
                 _ => compute.fill(&inputs, scratch, 0, out)?,
             }
             compute.finish(out);

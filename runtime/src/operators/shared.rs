@@ -6,12 +6,12 @@ use std::time::Instant;
 use tract_onnx::tract_hir::internal::*;
 
 use super::own::Compute;
-use crate::team::{Job, PATIENCE_MIN, Pieces, Team, try_lock};
+use crate::team::{Job, Pieces, TIMEOUT_MIN, Team, try_lock};
 
 /// What the helper computes for one operator. It writes to memory of its own, from the last piece on: a helper that was stopped half-way
 /// and goes on much later touches nothing that anybody else reads or has given to the next tick.
 #[derive(Debug)]
-pub(super) struct Lane<C: Compute> {
+pub(super) struct WorkerSlot<C: Compute> {
     compute: Arc<C>,
     pieces: Pieces,
     work: Mutex<Work<C>>,
@@ -28,7 +28,7 @@ struct Work<C: Compute> {
     filled_from: usize,
 }
 
-impl<C: Compute> Job for Lane<C> {
+impl<C: Compute> Job for WorkerSlot<C> {
     fn help(&self) {
         let mut work = self.work.lock().unwrap_or_else(PoisonError::into_inner);
         let Work { inputs, scratch, out, filled_from } = &mut *work;
@@ -47,7 +47,7 @@ impl<C: Compute> Job for Lane<C> {
     }
 }
 
-impl<C: Compute> Lane<C> {
+impl<C: Compute> WorkerSlot<C> {
     pub(super) fn new(compute: &Arc<C>) -> Arc<Self> {
         let out = vec![C::Number::default(); compute.shape().iter().product()];
         let work = Work { inputs: Vec::with_capacity(8), scratch: None, out, filled_from: 0 };
@@ -77,7 +77,7 @@ impl<C: Compute> Lane<C> {
         }
         let own = self.pieces.front();
         // Twice the time of one piece: the helper has at most one to finish.
-        let patience = PATIENCE_MIN.max(start.elapsed() * 2 / own.max(1) as u32);
+        let timeout = TIMEOUT_MIN.max(start.elapsed() * 2 / own.max(1) as u32);
         let own_len = out.len().min(len * own);
         let rest = &mut out[own_len..];
         let waited = Instant::now();
@@ -85,7 +85,7 @@ impl<C: Compute> Lane<C> {
             if rest.is_empty() {
                 break;
             }
-            if waited.elapsed() >= patience {
+            if waited.elapsed() >= timeout {
                 team.note_late();
                 return compute.fill(inputs, scratch, own_len, rest);
             }
@@ -176,18 +176,18 @@ mod tests {
         }
     }
 
-    fn run(lane: &Arc<Lane<Doubling>>, team: &Team, number: f32) -> Vec<f32> {
+    fn run(slot: &Arc<WorkerSlot<Doubling>>, team: &Team, number: f32) -> Vec<f32> {
         let mut out = vec![-1.0; LEN];
-        lane.fill(team, &[], &Arc::new(vec![number; LEN]), &mut out).unwrap();
+        slot.fill(team, &[], &Arc::new(vec![number; LEN]), &mut out).unwrap();
         out
     }
 
     #[test]
     fn both_threads_fill_one_result() {
         let (compute, team) = (Arc::new(Doubling::default()), Team::start(Duration::from_secs(1)).unwrap());
-        let lane = Lane::new(&compute);
+        let slot = WorkerSlot::new(&compute);
         for number in 0..200 {
-            assert_eq!(run(&lane, &team, number as f32), [2.0 * number as f32; LEN]);
+            assert_eq!(run(&slot, &team, number as f32), [2.0 * number as f32; LEN]);
         }
         assert!(compute.helped.load(Ordering::SeqCst), "the helper never came");
     }
@@ -195,21 +195,21 @@ mod tests {
     #[test]
     fn a_helper_that_is_stopped_in_its_share_is_not_waited_for_and_touches_nothing_afterwards() {
         let (compute, team) = (Arc::new(Doubling::default()), Team::start(Duration::from_secs(1)).unwrap());
-        let lane = Lane::new(&compute);
+        let slot = WorkerSlot::new(&compute);
         compute.stopped.store(true, Ordering::SeqCst);
         // Returns although the helper holds a piece for as long as it takes.
-        assert_eq!(run(&lane, &team, 1.0), [2.0; LEN]);
+        assert_eq!(run(&slot, &team, 1.0), [2.0; LEN]);
         assert!(team.take_late() && !team.take_late());
         // It is still at it in the next ticks.
-        assert_eq!(run(&lane, &team, 3.0), [6.0; LEN]);
+        assert_eq!(run(&slot, &team, 3.0), [6.0; LEN]);
         assert!(team.take_late());
         compute.stopped.store(false, Ordering::SeqCst);
         // And comes back with what nobody wants any more.
-        while try_lock(&lane.work).is_none() {
+        while try_lock(&slot.work).is_none() {
             std::thread::sleep(Duration::from_millis(1));
         }
         for number in 4..100 {
-            assert_eq!(run(&lane, &team, number as f32), [2.0 * number as f32; LEN]);
+            assert_eq!(run(&slot, &team, number as f32), [2.0 * number as f32; LEN]);
         }
     }
 }

@@ -1,4 +1,4 @@
-//! The one place where two threads meet: the desk puts a policy, the controller exchanges it for its own.
+//! The one place where two threads meet: the server puts a policy, the controller exchanges it for its own.
 
 use std::sync::atomic::{AtomicI32, AtomicU8, Ordering};
 use std::sync::{Mutex, PoisonError};
@@ -23,7 +23,7 @@ const TAKEN: u8 = 3;
 /// `T` is a policy.
 pub(super) struct Handover<T = Policy> {
     state: AtomicU8,
-    /// The desk's policy, then the controller's old one. The desk holds the lock for moments, and never while it works.
+    /// The server's policy, then the controller's old one. The server holds the lock for moments, and never while it works.
     place: Mutex<Option<T>>,
     /// The controller's thread, once it has looked in; else 0.
     ticking: AtomicI32,
@@ -36,7 +36,7 @@ impl<T> Default for Handover<T> {
 }
 
 impl<T> Handover<T> {
-    /// Desk: lays a policy out.
+    /// Server: lays a policy out.
     pub(super) fn put(&self, policy: T, when: When) {
         let ready = match when {
             When::Episode => READY_FOR_EPISODE,
@@ -46,12 +46,12 @@ impl<T> Handover<T> {
         self.state.store(ready, Ordering::Release);
     }
 
-    /// Desk: the thread that ticks, once it has looked in.
+    /// Server: the thread that ticks, once it has looked in.
     pub(super) fn ticking(&self) -> Option<i32> {
         Some(self.ticking.load(Ordering::Relaxed)).filter(|thread| *thread != 0)
     }
 
-    /// Desk: the controller's old policy, once it has taken the new one.
+    /// Server: the controller's old policy, once it has taken the new one.
     pub(super) fn old(&self) -> Option<T> {
         if self.state.load(Ordering::Acquire) != TAKEN {
             return None;
@@ -59,7 +59,7 @@ impl<T> Handover<T> {
         self.clear()
     }
 
-    /// Desk: takes the policy back. What comes back is the new one, or, if the controller was faster, its old one: then the
+    /// Server: takes the policy back. What comes back is the new one, or, if the controller was faster, its old one: then the
     /// second value is true.
     pub(super) fn withdraw(&self) -> (Option<T>, bool) {
         let mut place = self.place.lock().unwrap_or_else(PoisonError::into_inner);
@@ -74,7 +74,7 @@ impl<T> Handover<T> {
         policy
     }
 
-    /// Controller: see [`super::Swapper::poll`]. Never waits: where the desk has the lock, the next tick looks again.
+    /// Controller: see [`super::Swapper::poll`]. Never waits: where the server has the lock, the next tick looks again.
     pub(super) fn exchange(&self, moment: Moment, policy: &mut T) -> bool {
         self.ticking.store(rustix::thread::gettid().as_raw_nonzero().get(), Ordering::Relaxed);
         let wanted = match self.state.load(Ordering::Acquire) {
@@ -125,7 +125,7 @@ mod tests {
     }
 
     #[test]
-    fn the_controller_does_not_wait_for_the_desk() {
+    fn the_controller_does_not_wait_for_the_server() {
         let handover = Handover::default();
         let mut running = "old";
         handover.put("new", When::Now);

@@ -1,8 +1,8 @@
-//! What is said between the one who asks and the desk: one request and some answers, each a line of JSON, over a Unix socket.
+//! What is said between the one who asks and the server: one request and some answers, each a line of JSON, over a Unix socket.
 //!
 //! The socket has a name but no file (Linux, abstract): nothing is left behind by a run that is killed, and its name is free at once.
-//! A name belongs to whoever takes it first, so that each end looks who the other is: the desk serves its own user and root only, and who
-//! asks talks to a desk of their own user or root's only (root to any). Containers meet where they share the network
+//! A name belongs to whoever takes it first, so that each end looks who the other is: the server serves its own user and root only, and who
+//! asks talks to a server of their own user or root's only (root to any). Containers meet where they share the network
 //! namespace and `/dev/shm`.
 
 use std::io::{self, BufRead, BufReader, Read, Write};
@@ -28,9 +28,9 @@ const LINE_BYTES_MAX: u64 = 64 << 10;
 const NAME_BYTES_MAX: usize = 107;
 /// How often the one who asks looks at its stop flag.
 const LOOK: Duration = Duration::from_millis(100);
-/// How long the one who leaves still hears what the desk says about it.
+/// How long the one who leaves still hears what the server says about it.
 const LAST_WORDS: Duration = Duration::from_secs(1);
-/// And how long where the policy was laid out already, so that only the desk knows whether it was taken.
+/// And how long where the policy was laid out already, so that only the server knows whether it was taken.
 const LAST_WORDS_LAID_OUT: Duration = Duration::from_secs(10);
 
 /// When the new policy takes over.
@@ -43,7 +43,7 @@ pub enum When {
     Now,
 }
 
-/// What is asked of the desk.
+/// What is asked of the server.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub(super) struct Request {
@@ -52,7 +52,7 @@ pub(super) struct Request {
     pub(super) when: When,
 }
 
-/// What the desk says.
+/// What the server says.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 #[serde(tag = "state", rename_all = "lowercase")]
 pub enum Answer {
@@ -93,7 +93,7 @@ impl Answer {
 
 /// The socket's name. Containers may share a network, whose sockets these are, and still have a shared memory each: the number of that
 /// memory keeps runs apart that cannot meet.
-pub(super) fn desk_name(link: &LinkSettings) -> String {
+pub(super) fn server_name(link: &LinkSettings) -> String {
     let (prefix, memory) = (link.prefix.as_deref().unwrap_or(""), rcwm_models::wire::shared_memory_number());
     let name = format!("rcwm-swap/{memory}/{prefix}/{}", link.instance);
     if name.len() <= NAME_BYTES_MAX { name } else { format!("rcwm-swap/{}", sha256_hex(name.as_bytes())) }
@@ -119,21 +119,22 @@ pub(super) fn hear(stream: &UnixStream) -> io::Result<Request> {
 
 /// Asks the run on an instance to take over a bundle, and waits until it has or has not.
 ///
-/// `listen` is called with every answer. When `stop` is set or `patience` is over before the bundle was taken, it is withdrawn: the desk
-/// takes no bundle of somebody who had left before it was ready, so that nobody waits for a desk that is still loading.
+/// `listen` is called with every answer. When `stop` is set or `timeout` is over before the bundle was taken, it is withdrawn: the server
+/// takes no bundle of somebody who had left before it was ready, so that nobody waits for a server that is still loading.
 ///
 /// # Errors
-/// [`SwapError::NoDesk`], [`SwapError::Stranger`] and [`SwapError::Conversation`]; a bundle that is refused is [`Answer::Refused`].
+/// [`SwapError::NoServer`], [`SwapError::Stranger`] and [`SwapError::Conversation`]; a bundle that is refused is [`Answer::Refused`].
 pub fn ask(
     link: &LinkSettings,
     bundle: &Path,
     when: When,
-    patience: Option<Duration>,
+    timeout: Option<Duration>,
     stop: &AtomicBool,
     listen: &mut dyn FnMut(&Answer),
 ) -> Result<Answer, SwapError> {
-    let no_desk = |source| SwapError::NoDesk { instance: link.instance.clone(), source };
-    let stream = address(&desk_name(link)).and_then(|at| UnixStream::connect_addr(&at)).map_err(no_desk)?;
+    let no_server = |source| SwapError::NoServer { instance: link.instance.clone(), source };
+    let stream =
+        address(&server_name(link)).and_then(|at| UnixStream::connect_addr(&at)).map_err(no_server)?;
     let broken = |error: io::Error| SwapError::Conversation(format!("broke off: {error}"));
     let user = user_of_peer(&stream).map_err(broken)?;
     let own = rustix::process::geteuid().as_raw();
@@ -168,9 +169,9 @@ pub fn ask(
             Err(error) if is_timeout(&error) => {}
             Err(error) => return Err(broken(error)),
         }
-        let over = patience.is_some_and(|patience| start.elapsed() >= patience);
+        let over = timeout.is_some_and(|timeout| start.elapsed() >= timeout);
         if leaving.is_none() && (over || stop.load(Ordering::Relaxed)) {
-            // The desk sees that we leave, and still says how it ended.
+            // The server sees that we leave, and still says how it ended.
             stream.shutdown(Shutdown::Write).map_err(broken)?;
             leaving = Some(Instant::now());
         }
@@ -185,7 +186,7 @@ pub fn ask(
     }
 }
 
-/// The user of the process at the other end: of a desk, the one that opened it.
+/// The user of the process at the other end: of a server, the one that opened it.
 pub(super) fn user_of_peer(stream: &UnixStream) -> io::Result<u32> {
     let mut peer = libc::ucred { pid: 0, uid: 0, gid: 0 };
     let mut len = size_of::<libc::ucred>() as libc::socklen_t;
@@ -213,11 +214,11 @@ mod tests {
             prefix: Some("p".repeat(32)),
             ..LinkSettings::new("")
         };
-        let (a, b) = (desk_name(&link("a")), desk_name(&link("b")));
+        let (a, b) = (server_name(&link("a")), server_name(&link("b")));
         assert_ne!(a, b);
         address(&a).unwrap();
         let plain = LinkSettings { prefix: None, ..LinkSettings::new("arm") };
         let memory = rcwm_models::wire::shared_memory_number();
-        assert_eq!(desk_name(&plain), format!("rcwm-swap/{memory}//arm"), "told apart by shared memory");
+        assert_eq!(server_name(&plain), format!("rcwm-swap/{memory}//arm"), "told apart by shared memory");
     }
 }

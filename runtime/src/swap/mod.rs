@@ -3,7 +3,7 @@
 //! ```text
 //! rcwm-runtime swap --instance arm --bundle DIR        asks, waits, says what happened
 //!        |  socket of the instance
-//!   desk's thread, lowest priority        loads the bundle, verifies it against its golden values, warms it up
+//!   server's thread, lowest priority        loads the bundle, verifies it against its golden values, warms it up
 //!        |  handover                      one place; nobody waits for it
 //!   controller's thread                   looks in after an action was sent, and exchanges the two policies
 //! ```
@@ -18,16 +18,16 @@
 //! mean different things even where their sizes match. It was trained like that: every training sequence begins so, wherever in an
 //! episode it was cut from.
 
-mod desk;
 mod handover;
 mod message;
 mod prepare;
 mod priority;
+mod server;
 
-/// Name of the desk of a link: that of an abstract Unix socket.
+/// Name of the server of a link: that of an abstract Unix socket.
 #[must_use]
-pub fn name_of_desk(link: &LinkSettings) -> String {
-    message::desk_name(link)
+pub fn name_of_server(link: &LinkSettings) -> String {
+    message::server_name(link)
 }
 
 pub use handover::Moment;
@@ -47,8 +47,8 @@ use rcwm_models::wire::LinkSettings;
 use crate::engine::EngineSettings;
 use crate::policy::{Policy, PolicyError, Sampling};
 use crate::verify::VerifyError;
-use desk::Desk;
 use handover::Handover;
+use server::Server;
 
 /// Why a bundle was not taken over, or nobody could be asked.
 #[derive(Debug, thiserror::Error)]
@@ -92,12 +92,12 @@ pub enum SwapError {
     /// The one who asked has left, or the run ends.
     #[error("nobody wants the bundle any more")]
     Unwanted,
-    /// The desk could not be opened.
+    /// The server could not be opened.
     #[error(
-        "the swap desk {name:?} cannot be opened: {source}; another run with this instance and RCWM_PREFIX may have it, also one in a \
+        "the swap server {name:?} cannot be opened: {source}; another run with this instance and RCWM_PREFIX may have it, also one in a \
          container on this network"
     )]
-    Desk {
+    Server {
         /// Name of the socket.
         name: String,
         /// What the system said.
@@ -108,21 +108,21 @@ pub enum SwapError {
         "no run on instance {instance:?} takes swaps: {source}; start `rcwm-runtime run --instance {instance}` (same machine, \
          same RCWM_PREFIX, without --record)"
     )]
-    NoDesk {
+    NoServer {
         /// The instance.
         instance: String,
         /// What the system said.
         source: io::Error,
     },
-    /// Somebody else has the desk's name.
+    /// Somebody else has the server's name.
     #[error(
-        "the swap desk of instance {instance:?} belongs to user {user}, who is neither you nor root: nothing was asked; start the run and \
+        "the swap server of instance {instance:?} belongs to user {user}, who is neither you nor root: nothing was asked; start the run and \
          this program as the same user"
     )]
     Stranger {
         /// The instance.
         instance: String,
-        /// The desk's user.
+        /// The server's user.
         user: u32,
     },
     /// The run ended or spoke in a way that is not understood.
@@ -134,10 +134,10 @@ fn more(others: usize) -> String {
     if others > 0 { format!(" (and {others} more)") } else { String::new() }
 }
 
-/// How the desk prepares a policy.
+/// How the server prepares a policy.
 #[derive(Debug, Clone)]
 pub struct SwapSettings {
-    /// The controller's link; names the desk.
+    /// The controller's link; names the server.
     pub link: LinkSettings,
     /// Engine of the policies.
     pub engine: EngineSettings,
@@ -147,44 +147,44 @@ pub struct SwapSettings {
     pub rate_hz: f64,
 }
 
-/// How long the end of a run waits for its desk.
-const PATIENCE: Duration = Duration::from_millis(500);
-/// A desk was left in the middle of its work.
-static DESK_LEFT: AtomicBool = AtomicBool::new(false);
+/// How long the end of a run waits for its server.
+const TIMEOUT: Duration = Duration::from_millis(500);
+/// A server was left in the middle of its work.
+static SERVER_LEFT: AtomicBool = AtomicBool::new(false);
 
-/// Whether a desk was still loading when its run ended. Its thread goes on, in memory that a process's usual end would tear down under
+/// Whether a server was still loading when its run ended. Its thread goes on, in memory that a process's usual end would tear down under
 /// it: such a process is to end at once.
 #[must_use]
-pub fn desk_is_left() -> bool {
-    DESK_LEFT.load(Ordering::Relaxed)
+pub fn server_is_left() -> bool {
+    SERVER_LEFT.load(Ordering::Relaxed)
 }
 
 /// The controller's end: takes over a policy that is ready.
 pub struct Swapper {
     handover: Arc<Handover>,
     stop: Arc<AtomicBool>,
-    desk: Option<JoinHandle<()>>,
-    sweeper: Option<JoinHandle<()>>,
+    server: Option<JoinHandle<()>>,
+    reaper: Option<JoinHandle<()>>,
 }
 
 impl Swapper {
-    /// Opens the desk of an instance and starts its thread.
+    /// Opens the server of an instance and starts its thread.
     ///
     /// # Errors
-    /// [`SwapError::Desk`].
+    /// [`SwapError::Server`].
     pub fn start(settings: SwapSettings) -> Result<Self, SwapError> {
-        let name = message::desk_name(&settings.link);
-        let failed = |source| SwapError::Desk { name: name.clone(), source };
+        let name = message::server_name(&settings.link);
+        let failed = |source| SwapError::Server { name: name.clone(), source };
         let listener = message::address(&name).and_then(|at| UnixListener::bind_addr(&at)).map_err(failed)?;
         listener.set_nonblocking(true).map_err(failed)?;
         let (handover, stop) = (Arc::new(Handover::default()), Arc::new(AtomicBool::new(false)));
         let (old, policies) = channel();
         let named = |name: &str| std::thread::Builder::new().name(name.into());
         let shared = Arc::clone(&handover);
-        let sweeper = named("swap-sweeper").spawn(move || desk::sweep(&policies, &shared)).map_err(failed)?;
-        let desk = Desk::new(settings, listener, Arc::clone(&handover), Arc::clone(&stop), old);
-        let desk = named("swap").spawn(move || desk.serve()).map_err(failed)?;
-        Ok(Self { handover, stop, desk: Some(desk), sweeper: Some(sweeper) })
+        let reaper = named("swap-reaper").spawn(move || server::reap(&policies, &shared)).map_err(failed)?;
+        let server = Server::new(settings, listener, Arc::clone(&handover), Arc::clone(&stop), old);
+        let server = named("swap").spawn(move || server.serve()).map_err(failed)?;
+        Ok(Self { handover, stop, server: Some(server), reaper: Some(reaper) })
     }
 
     /// Exchanges `policy` for one that is ready and wanted at this moment; true if so. To be called by the thread that ticks, in its
@@ -200,15 +200,15 @@ impl Drop for Swapper {
     fn drop(&mut self) {
         self.stop.store(true, Ordering::Relaxed);
         let start = Instant::now();
-        // The desk first: the sweeper ends when nobody can bring it anything.
-        for thread in self.desk.take().into_iter().chain(self.sweeper.take()) {
+        // The server first: the reaper ends when nobody can bring it anything.
+        for thread in self.server.take().into_iter().chain(self.reaper.take()) {
             thread.thread().unpark();
-            while !thread.is_finished() && start.elapsed() < PATIENCE {
+            while !thread.is_finished() && start.elapsed() < TIMEOUT {
                 std::thread::sleep(Duration::from_millis(2));
             }
             // Whatever a bundle makes it do, the end of the run does not wait for it.
             if !thread.is_finished() {
-                DESK_LEFT.store(true, Ordering::Relaxed);
+                SERVER_LEFT.store(true, Ordering::Relaxed);
                 return;
             }
             // A panic there has been printed; there is nothing left to do about it.

@@ -1,4 +1,4 @@
-//! The desk's thread gives way to everything else; what it makes for the controller does not.
+//! The server's thread gives way to everything else; what it makes for the controller does not.
 
 use std::collections::BTreeSet;
 use std::io;
@@ -24,7 +24,7 @@ pub(super) fn threads() -> io::Result<BTreeSet<i32>> {
     ids.filter_map(Result::transpose).collect()
 }
 
-/// Gives `to` the scheduling of `from`. Threads that an engine starts for a policy have inherited the desk's priority, and must not
+/// Gives `to` the scheduling of `from`. Threads that an engine starts for a policy have inherited the server's priority, and must not
 /// hold up the ticks they work for.
 pub(super) fn give(from: i32, to: i32) -> io::Result<()> {
     let mut parameters = libc::sched_param { sched_priority: 0 };
@@ -70,7 +70,7 @@ mod tests {
         assert!(before.contains(&asking));
         let (ready, started) = std::sync::mpsc::channel();
         let (stop, stopped) = std::sync::mpsc::channel::<()>();
-        let desk = std::thread::spawn(move || {
+        let server = std::thread::spawn(move || {
             lower().unwrap();
             let helper = std::thread::spawn(move || {
                 ready.send(gettid()).unwrap();
@@ -88,6 +88,6 @@ mod tests {
             Err(error) => assert_eq!(error.kind(), io::ErrorKind::PermissionDenied),
         }
         drop(stop);
-        desk.join().unwrap();
+        server.join().unwrap();
     }
 }

@@ -7,7 +7,7 @@ use std::time::{Duration, Instant};
 
 use rcwm_models::wire::{Action, ActionObserverLink, ActionSource, LinkSettings, ObserverLink, Wait};
 
-use crate::PATIENCE;
+use crate::TIMEOUT;
 
 /// Time between two looks, far below any period used here.
 const LOOK: Duration = Duration::from_micros(100);
@@ -73,11 +73,11 @@ impl Witness {
     /// The first action published after `time_ns` that fits.
     ///
     /// # Panics
-    /// When none comes within [`PATIENCE`].
+    /// When none comes within [`TIMEOUT`].
     #[must_use]
     pub fn action_after(&self, time_ns: u64, what: &str, fits: impl Fn(&Action) -> bool) -> Action {
         let start = Instant::now();
-        while start.elapsed() < PATIENCE {
+        while start.elapsed() < TIMEOUT {
             let record = self.record.lock().unwrap_or_else(PoisonError::into_inner);
             let later = record.actions.iter().rev().take_while(|action| action.published_ns > time_ns);
             if let Some(action) = later.filter(|action| fits(action)).last() {
@@ -86,7 +86,7 @@ impl Witness {
             drop(record);
             std::thread::sleep(LOOK);
         }
-        panic!("{what}: no such action within {PATIENCE:?}");
+        panic!("{what}: no such action within {TIMEOUT:?}");
     }
 
     /// The last observation so far.

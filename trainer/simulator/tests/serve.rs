@@ -16,7 +16,7 @@ use rcwm_simulator::report::Tally;
 use rcwm_simulator::serve::{Pace, ServeSettings, serve};
 
 /// A controller that gives up after so long has met a defect.
-const PATIENCE: Duration = Duration::from_secs(60);
+const TIMEOUT: Duration = Duration::from_secs(60);
 
 fn link_settings(instance: &str) -> LinkSettings {
     let prefix = Some(format!("sim{}", std::process::id()));
@@ -31,7 +31,7 @@ fn serve_settings(instance: &str) -> ServeSettings {
         steps_max: 5,
         pace: Pace::LockStep,
         policy: Policy::Remote,
-        silence_max: Some(PATIENCE),
+        silence_max: Some(TIMEOUT),
         snapshots: None,
     }
 }
@@ -64,7 +64,7 @@ fn action(answers: u64, action: [f32; ACTION_LEN]) -> Action {
 
 fn next(link: &ControllerLink) -> Option<Box<Observation>> {
     let start = Instant::now();
-    while start.elapsed() < PATIENCE {
+    while start.elapsed() < TIMEOUT {
         match link.wait_observation(Duration::from_millis(100)).unwrap() {
             Wait::Message(observation) => return Some(Box::new(*observation)),
             Wait::TimedOut => {}
@@ -225,7 +225,7 @@ fn moved_until_left(
         link.send(action(observation.sequence, [0.5, -0.5, 0.25, 0.75])).unwrap();
         let left = leave(link);
         let (start, mut seen) = (Instant::now(), Vec::new());
-        while start.elapsed() < PATIENCE {
+        while start.elapsed() < TIMEOUT {
             match watcher.wait_observation(Duration::from_millis(100)).unwrap() {
                 Wait::Message(observation) => seen.push(*observation),
                 Wait::TimedOut => {}

@@ -15,10 +15,10 @@ use super::super::PolicyError;
 use super::super::stages::StageClock;
 use super::pieces::{Piece, Values};
 use crate::operators::SharedTeam;
-use crate::team::{Job, PATIENCE_MIN, try_lock};
+use crate::team::{Job, TIMEOUT_MIN, try_lock};
 
 /// The helper is late when the caller has waited for this part of the time that its own branch has taken.
-const PATIENCE: u32 = 4;
+const TIMEOUT_DIVISOR: u32 = 4;
 
 /// An error, and the part it comes from.
 pub(super) type RunError = (PartName, TractError);
@@ -73,45 +73,45 @@ impl Branches {
 pub(super) struct Beside {
     team: SharedTeam,
     robot: Piece,
-    lane: Arc<Lane>,
+    slot: Arc<WorkerSlot>,
     spare: Piece,
     spare_is_new: bool,
-    /// Number of the last errand.
-    errand: u64,
+    /// Number of the last task.
+    task: u64,
 }
 
-/// What belongs to the helper while it is on an errand, and to the caller otherwise.
-struct Lane {
+/// What belongs to the helper while it is on an task, and to the caller otherwise.
+struct WorkerSlot {
     work: Mutex<LaneWork>,
-    /// Number of the last errand that is done.
+    /// Number of the last task that is done.
     done: AtomicU64,
 }
 
 struct LaneWork {
     environment: Piece,
-    errand: u64,
+    task: u64,
     inputs: Option<TVec<TValue>>,
     results: Option<Results>,
     spent_ns: u64,
 }
 
-impl Job for Lane {
+impl Job for WorkerSlot {
     fn help(&self) {
         let mut work = self.work.lock().unwrap_or_else(PoisonError::into_inner);
         let start = Instant::now();
-        // A helper that was stopped right here may find the next errand, and be sent on it once more.
+        // A helper that was stopped right here may find the next task, and be sent on it once more.
         let Some(inputs) = work.inputs.take() else { return };
         work.results = Some(work.environment.run_on(inputs));
         work.spent_ns = start.elapsed().as_nanos() as u64;
-        let errand = work.errand;
+        let task = work.task;
         drop(work);
-        self.done.store(errand, Ordering::Release);
+        self.done.store(task, Ordering::Release);
     }
 }
 
-impl Lane {
-    fn is_done(&self, errand: u64) -> bool {
-        self.done.load(Ordering::Acquire) == errand
+impl WorkerSlot {
+    fn is_done(&self, task: u64) -> bool {
+        self.done.load(Ordering::Acquire) == task
     }
 
     /// None while the helper is at it.
@@ -123,9 +123,9 @@ impl Lane {
 impl Beside {
     fn new(robot: Piece, environment: Piece, team: &SharedTeam) -> Result<Self, PolicyError> {
         let spare = environment.twin().map_err(|error| super::run_error(environment.part, &error))?;
-        let work = LaneWork { environment, errand: 0, inputs: None, results: None, spent_ns: 0 };
-        let lane = Arc::new(Lane { work: Mutex::new(work), done: AtomicU64::new(0) });
-        Ok(Self { team: Arc::clone(team), robot, lane, spare, spare_is_new: true, errand: 0 })
+        let work = LaneWork { environment, task: 0, inputs: None, results: None, spent_ns: 0 };
+        let slot = Arc::new(WorkerSlot { work: Mutex::new(work), done: AtomicU64::new(0) });
+        Ok(Self { team: Arc::clone(team), robot, slot, spare, spare_is_new: true, task: 0 })
     }
 
     fn run(&mut self, values: &mut Values, clock: &mut StageClock) -> Result<(), RunError> {
@@ -133,7 +133,7 @@ impl Beside {
         let start = Instant::now();
         self.robot.run(values).map_err(|error| (self.robot.part, error))?;
         clock.ended(self.robot.part);
-        self.wait(PATIENCE_MIN.max(start.elapsed() / PATIENCE));
+        self.wait(TIMEOUT_MIN.max(start.elapsed() / TIMEOUT_DIVISOR));
         let (results, spent_ns) = match self.brought() {
             Some(brought) => brought,
             None => self.take_over(values, clock),
@@ -147,26 +147,26 @@ impl Beside {
     /// Sends the helper, unless it has not come back from the last time.
     fn send(&mut self, values: &Values) {
         // What it may still bring from then has another number.
-        self.errand += 1;
-        if let Some(mut work) = self.lane.try_lock() {
-            work.errand = self.errand;
+        self.task += 1;
+        if let Some(mut work) = self.slot.try_lock() {
+            work.task = self.task;
             work.inputs = Some(work.environment.inputs(values));
             work.results = None;
             drop(work);
-            self.team.send(Arc::clone(&self.lane) as Arc<dyn Job>);
+            self.team.send(Arc::clone(&self.slot) as Arc<dyn Job>);
         }
     }
 
-    fn wait(&self, patience: Duration) {
+    fn wait(&self, timeout: Duration) {
         let start = Instant::now();
-        while !self.lane.is_done(self.errand) && start.elapsed() < patience {
+        while !self.slot.is_done(self.task) && start.elapsed() < timeout {
             std::hint::spin_loop();
         }
     }
 
     /// What the helper has brought; none if it is late.
     fn brought(&self) -> Option<Brought> {
-        let mut work = self.lane.try_lock().filter(|work| work.errand == self.errand)?;
+        let mut work = self.slot.try_lock().filter(|work| work.task == self.task)?;
         if work.results.is_none() {
             // It has not begun, and need not.
             self.team.call_off();
@@ -180,8 +180,8 @@ impl Beside {
         clock.helper_late = true;
         let start = Instant::now();
         loop {
-            let (lane, errand) = (&self.lane, self.errand);
-            let results = self.spare.run_unless(|| lane.is_done(errand), self.spare.inputs(values));
+            let (slot, task) = (&self.slot, self.task);
+            let results = self.spare.run_unless(|| slot.is_done(task), self.spare.inputs(values));
             if let Some(results) = results.transpose() {
                 return (results, start.elapsed().as_nanos() as u64);
             }
@@ -275,13 +275,13 @@ mod tests {
     fn what_a_helper_brings_from_an_earlier_image_is_not_taken() {
         let (mut beside, mut values) = beside();
         ask(&mut beside, &mut values, 1.0);
-        let lane = Arc::clone(&beside.lane);
+        let slot = Arc::clone(&beside.slot);
         // As if the helper were still at it when the next image comes, and done a moment later.
-        let still_at_it = lane.work.lock().unwrap();
+        let still_at_it = slot.work.lock().unwrap();
         show(&mut values, 2.0);
         beside.send(&values);
         drop(still_at_it);
-        assert!(lane.work.lock().unwrap().results.is_some(), "the first image's");
+        assert!(slot.work.lock().unwrap().results.is_some(), "the first image's");
         assert!(beside.brought().is_none());
         let mut clock = StageClock::start();
         assert_eq!(first(beside.take_over(&values, &mut clock)), -2.0);

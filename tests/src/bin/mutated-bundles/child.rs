@@ -62,8 +62,8 @@ impl Child {
     pub(crate) fn work_on(&mut self, seed: u64, arguments: &Arguments) -> anyhow::Result<Ended> {
         // A child that died before it was asked shows below as one that does not answer.
         let _ = writeln!(self.seeds, "{seed}").and_then(|()| self.seeds.flush());
-        let patience = Duration::from_secs_f64(arguments.wall_s_max);
-        match self.answers.recv_timeout(patience) {
+        let timeout = Duration::from_secs_f64(arguments.wall_s_max);
+        match self.answers.recv_timeout(timeout) {
             Ok(line) => Ok(Ended::Answered(serde_json::from_str(&line).context(line)?)),
             Err(reason) => {
                 let gone = std::mem::replace(self, Self::start(arguments)?);

@@ -1,4 +1,4 @@
-//! A desk that does not get on, whatever a bundle or the machine makes it do: nobody waits for it. The desk's thread alone is held, by
+//! A server that does not get on, whatever a bundle or the machine makes it do: nobody waits for it. The server's thread alone is held, by
 //! ptrace, as if it loaded for ever.
 
 #![allow(clippy::unwrap_used, reason = "a test that fails panics")]
@@ -64,22 +64,22 @@ fn is_gone(thread: i32) -> bool {
 }
 
 #[test]
-fn neither_who_asks_nor_the_end_of_the_run_waits_for_a_desk_that_does_not_get_on() {
+fn neither_who_asks_nor_the_end_of_the_run_waits_for_a_server_that_does_not_get_on() {
     let link = own_link();
     let peer = link.peer();
     let mut run = start(&link);
     support::ask(&peer, &observation(0, 0));
-    let desk = thread_of(&run, "swap");
-    if !hold(desk) {
+    let server = thread_of(&run, "swap");
+    if !hold(server) {
         eprintln!("left out: this system does not let a program hold a thread of its child");
         run.kill().unwrap();
         run.wait().unwrap();
         return;
     }
     let mut heard = Vec::new();
-    let patience = Some(Duration::from_millis(200));
+    let timeout = Some(Duration::from_millis(200));
     let stop = AtomicBool::new(false);
-    let answer = ask(&link.0, &smallest_bundle(), When::Now, patience, &stop, &mut |answer| {
+    let answer = ask(&link.0, &smallest_bundle(), When::Now, timeout, &stop, &mut |answer| {
         heard.push(answer.clone());
     });
     assert_eq!((answer.unwrap(), heard), (Answer::Withdrawn, vec![]));
@@ -95,7 +95,7 @@ fn neither_who_asks_nor_the_end_of_the_run_waits_for_a_desk_that_does_not_get_on
         assert!(!matches!(wait, Wait::Message(_)), "{wait:?}");
     }
     assert!(told, "the robot was not told");
-    let gone = is_gone(desk);
+    let gone = is_gone(server);
     if !gone {
         run.kill().unwrap();
     }

@@ -1,4 +1,4 @@
-//! The desk's thread: hears requests one after another, prepares, hands over, and says what happened.
+//! The server's thread: hears requests one after another, prepares, hands over, and says what happened.
 
 use std::io::{self, Read};
 use std::os::unix::net::{UnixListener, UnixStream};
@@ -14,30 +14,30 @@ use super::message::{self, Answer, Request};
 use super::{SwapError, SwapSettings, prepare, priority};
 use crate::policy::Policy;
 
-/// How often the desk looks for somebody who asks.
+/// How often the server looks for somebody who asks.
 const LOOK: Duration = Duration::from_millis(50);
 /// How often it looks whether its policy was taken.
 const LOOK_READY: Duration = Duration::from_millis(5);
 /// How long somebody who has come may take to say what they want.
-const REQUEST_PATIENCE: Duration = Duration::from_secs(2);
+const REQUEST_TIMEOUT: Duration = Duration::from_secs(2);
 
-pub(super) struct Desk {
+pub(super) struct Server {
     settings: SwapSettings,
     listener: UnixListener,
     handover: Arc<Handover>,
     stop: Arc<AtomicBool>,
-    sweeper: Sender<Policy>,
+    reaper: Sender<Policy>,
 }
 
-impl Desk {
+impl Server {
     pub(super) fn new(
         settings: SwapSettings,
         listener: UnixListener,
         handover: Arc<Handover>,
         stop: Arc<AtomicBool>,
-        sweeper: Sender<Policy>,
+        reaper: Sender<Policy>,
     ) -> Self {
-        Self { settings, listener, handover, stop, sweeper }
+        Self { settings, listener, handover, stop, reaper }
     }
 
     fn stopped(&self) -> bool {
@@ -58,8 +58,8 @@ impl Desk {
 
     fn converse(&self, stream: &UnixStream, lowered: &Result<(), String>) -> io::Result<()> {
         stream.set_nonblocking(false)?;
-        stream.set_read_timeout(Some(REQUEST_PATIENCE))?;
-        stream.set_write_timeout(Some(REQUEST_PATIENCE))?;
+        stream.set_read_timeout(Some(REQUEST_TIMEOUT))?;
+        stream.set_write_timeout(Some(REQUEST_TIMEOUT))?;
         let refuse = |reason: String| message::say(stream, &Answer::Refused { reason });
         if !may_ask(stream)? {
             return refuse("only the user of the run, or root, may ask for a swap".into());
@@ -133,7 +133,7 @@ impl Desk {
         let waited_s = start.elapsed().as_secs_f64();
         if let Some(old) = old {
             // It is there until this thread has ended.
-            let _ = self.sweeper.send(old);
+            let _ = self.reaper.send(old);
         }
         let (preset, updates) = (provenance.preset, provenance.updates);
         let answer = answer.unwrap_or(Answer::Taken { task, preset, updates, waited_s });
@@ -143,7 +143,7 @@ impl Desk {
 
 /// Drops old policies, on a thread that is not of low priority: their memory belongs to the thread that has ticked with them, and whoever
 /// gives it back holds that thread's allocator for a moment. One that is not scheduled meanwhile would hold up a tick.
-pub(super) fn sweep(policies: &Receiver<Policy>, handover: &Handover) {
+pub(super) fn reap(policies: &Receiver<Policy>, handover: &Handover) {
     for old in policies {
         if let Some(ticking) = handover.ticking() {
             // Where that is not allowed, the priority it was started with must do.
