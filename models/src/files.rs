@@ -87,13 +87,11 @@ impl FileError {
     }
 }
 
-/// Reads a whole plain file of at most `bytes_max` bytes. Links are followed: data are often links into a store of large files.
-///
-/// What is checked is what is read: a link that is turned elsewhere meanwhile changes nothing. A pipe is refused, not waited for.
+/// Opens a plain file of at most `bytes_max` bytes, and says how many it has. See [`read_capped`].
 ///
 /// # Errors
-/// [`FileError::NotAFile`], [`FileError::TooLarge`] before anything is read, or [`FileError::Io`].
-pub fn read_capped(path: &Path, bytes_max: u64) -> Result<Vec<u8>, FileError> {
+/// [`FileError::NotAFile`], [`FileError::TooLarge`] or [`FileError::Io`].
+pub fn open_capped(path: &Path, bytes_max: u64) -> Result<(File, u64), FileError> {
     let without_waiting = OFlags::NONBLOCK.bits() as i32;
     let open = OpenOptions::new().read(true).custom_flags(without_waiting).open(path);
     let file = open.map_err(FileError::io(path))?;
@@ -101,15 +99,27 @@ pub fn read_capped(path: &Path, bytes_max: u64) -> Result<Vec<u8>, FileError> {
     if !meta.is_file() {
         return Err(FileError::NotAFile { path: path.to_path_buf() });
     }
-    let too_large = |found| FileError::TooLarge { path: path.to_path_buf(), found, limit: bytes_max };
-    if meta.len() > bytes_max {
-        return Err(too_large(meta.len()));
+    let found = meta.len();
+    if found > bytes_max {
+        return Err(FileError::TooLarge { path: path.to_path_buf(), found, limit: bytes_max });
     }
-    let mut bytes = Vec::with_capacity(meta.len() as usize);
+    Ok((file, found))
+}
+
+/// Reads a whole plain file of at most `bytes_max` bytes. Links are followed: data are often links into a store of large files.
+///
+/// What is checked is what is read: a link that is turned elsewhere meanwhile changes nothing. A pipe is refused, not waited for.
+///
+/// # Errors
+/// [`FileError::NotAFile`], [`FileError::TooLarge`] before anything is read, or [`FileError::Io`].
+pub fn read_capped(path: &Path, bytes_max: u64) -> Result<Vec<u8>, FileError> {
+    let (file, found) = open_capped(path, bytes_max)?;
+    let mut bytes = Vec::with_capacity(found as usize);
     // The file may grow between the check and the read: the reader is limited as well.
     file.take(bytes_max + 1).read_to_end(&mut bytes).map_err(FileError::io(path))?;
     if bytes.len() as u64 > bytes_max {
-        return Err(too_large(bytes.len() as u64));
+        let found = bytes.len() as u64;
+        return Err(FileError::TooLarge { path: path.to_path_buf(), found, limit: bytes_max });
     }
     Ok(bytes)
 }

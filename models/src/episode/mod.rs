@@ -373,6 +373,24 @@ mod tests {
     }
 
     #[test]
+    fn a_second_look_survives_the_file_and_a_pipe_in_its_place_is_not_waited_for() {
+        let folder = tempfile::tempdir().unwrap();
+        let path = folder.path().join("episode.npz");
+        let plain = Episode::blank(3);
+        plain.write(&path).unwrap();
+        assert!(!Episode::is_disturbed(&path).unwrap());
+        let image = Array4::from_elem((3, IMAGE_SIDE, IMAGE_SIDE, IMAGE_CHANNELS), 7);
+        let disturbed = Episode { disturbed: Some(image), ..plain };
+        disturbed.write(&path).unwrap();
+        assert!(Episode::is_disturbed(&path).unwrap());
+        assert_eq!(Episode::read(&path).unwrap(), disturbed);
+        assert_eq!(Episode::read(&path).unwrap().shortened(2).disturbed.unwrap().shape()[0], 2);
+        let pipe = folder.path().join("pipe.npz");
+        assert!(std::process::Command::new("mkfifo").arg(&pipe).status().unwrap().success());
+        assert!(matches!(Episode::is_disturbed(&pipe), Err(EpisodeError::File(FileError::NotAFile { .. }))));
+    }
+
+    #[test]
     fn a_damaged_file_is_one_clear_error() {
         let mut builder = EpisodeBuilder::new();
         builder.push(&observation(0, true, true)).unwrap();

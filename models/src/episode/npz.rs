@@ -10,7 +10,8 @@ use zip::write::SimpleFileOptions;
 use zip::{CompressionMethod, ZipArchive, ZipWriter};
 
 use super::npy::{Array, Header};
-use super::{Episode, EpisodeError, STEPS_MAX, robot_above};
+use super::{EPISODE_BYTES_MAX, Episode, EpisodeError, STEPS_MAX, robot_above};
+use crate::files::open_capped;
 use crate::{ACTION_LEN, IMAGE_CHANNELS, IMAGE_SIDE, PROPRIOCEPTION_LEN};
 
 /// Key of the pictures in another look.
@@ -19,7 +20,7 @@ pub(super) const DISTURBED: &str = "disturbed";
 /// Whether the archive at `path` has an array of this name.
 pub(super) fn has(path: &Path, key: &str) -> Result<bool, EpisodeError> {
     let broken = |reason: String| EpisodeError::Archive { path: path.to_path_buf(), reason };
-    let file = std::fs::File::open(path).map_err(|error| broken(error.to_string()))?;
+    let (file, _) = open_capped(path, EPISODE_BYTES_MAX)?;
     let archive = ZipArchive::new(BufReader::new(file)).map_err(|error| broken(error.to_string()))?;
     Ok(archive.index_for_name(&format!("{key}.npy")).is_some())
 }

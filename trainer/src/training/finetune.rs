@@ -1,6 +1,7 @@
 use std::collections::VecDeque;
 use std::path::{Path, PathBuf};
 use std::sync::atomic::{AtomicBool, Ordering};
+use std::time::Duration;
 
 use candle_core::Device;
 use serde_json::json;
@@ -28,6 +29,8 @@ const ACTING_STREAM: u64 = 0x0061_6374_696e;
 /// Numbers of the policy's episodes, and with them their layouts, begin behind those of the scripts; each simulator has its own.
 const FIRST_EPISODE: u64 = Script::END;
 const EPISODES_A_SIMULATOR: u64 = 1_000_000;
+/// How long a separate episode may take before the simulators that wait for its end give up.
+const EVALUATED_EPISODE_MAX: Duration = Duration::from_secs(60);
 /// Steps of the environment in one decision of the policy.
 const ACTION_REPEAT: u64 = 2;
 
@@ -408,12 +411,17 @@ impl Finetuning {
         let launch = |index: usize| {
             let instance = format!("{}-{}-{index}", self.settings.phase.verb(), std::process::id());
             let first = FIRST_EPISODE + index as u64 * EPISODES_A_SIMULATOR + self.state.episodes;
+            let usual = Launch::remote(&self.settings.task, &instance, self.settings.seed);
+            let evaluation = &finetune.evaluation;
+            let evaluated = if evaluation.every_steps > 0 { evaluation.episodes } else { 0 };
             Launch {
+                // They stand still while separate episodes are run.
+                silence_max: usual.silence_max + EVALUATED_EPISODE_MAX * evaluated as u32,
                 first_episode: first,
                 steps_max: finetune.episode_steps,
                 masks: finetune.masks,
                 disturb: finetune.disturb.clone(),
-                ..Launch::remote(&self.settings.task, &instance, self.settings.seed)
+                ..usual
             }
         };
         (0..finetune.simulators).map(launch).collect()
