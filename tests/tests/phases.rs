@@ -78,3 +78,44 @@ fn fine_tuning_goes_from_a_checkpoint_of_another_phase() {
     assert!(run.printed().contains("100 steps, 1 episodes"), "{}", run.printed());
     assert!(out.join("checkpoints/last/checkpoint.toml").exists());
 }
+
+/// Separate episodes, on layouts that it never learns from, are rows of its metrics, and two seeds of them a curve of the report.
+#[test]
+fn a_run_is_evaluated_while_it_learns_and_the_report_draws_its_curve() {
+    let (domain, folder) = (Domain::new(), tempfile::tempdir().unwrap());
+    let mut report = domain.command("rcwm-trainer");
+    report.args(["evaluate", "--report"]).arg(folder.path().join("report"));
+    for seed in ["0", "1"] {
+        let out = folder.path().join(seed);
+        let begin = ["train", "--task", "reach", "--preset", "debug", "--simulators", "1", "--seed", seed];
+        let rest = [
+            "--set",
+            "finetune.steps=60",
+            "--set",
+            "finetune.episode_steps=20",
+            "--set",
+            "finetune.warm_up_updates=1",
+            "--set",
+            "finetune.evaluation.every_steps=40",
+            "--set",
+            "finetune.evaluation.episodes=2",
+        ];
+        Running::start(trainer(&domain, &[&begin[..], &rest].concat(), &out)).succeed();
+        let found: Vec<_> = lines(&out).into_iter().filter(|line| !line["evaluation"].is_null()).collect();
+        let of = |key: &str| found.iter().map(|line| line["evaluation"][key].clone()).collect::<Vec<_>>();
+        assert_eq!(of("policy_steps"), [0, 40]);
+        assert_eq!((of("episodes"), of("layouts")), (vec![2.into(); 2], vec!["choosing".into(); 2]));
+        report.arg("--runs").arg(format!("from scratch={}", out.display()));
+    }
+    Running::start(report).succeed();
+    let read = rcwm_tests::read_json(&folder.path().join("report/report.json"));
+    let curve = &read["learning_curves"][0];
+    let steps: Vec<_> =
+        curve["points"].as_array().unwrap().iter().map(|at| &at["environment_steps"]).collect();
+    assert_eq!(steps, [0, 80]);
+    assert_eq!(
+        (&curve["label"], curve["points"][0]["rates"].as_array().unwrap().len()),
+        (&"from scratch".into(), 2)
+    );
+    assert_eq!(domain.leftovers(), Vec::<String>::new());
+}

@@ -1,6 +1,5 @@
 //! Masks as pictures, one a step, in any of the ways in which segmentation programs write them.
 
-use std::fs::File;
 use std::io::BufReader;
 use std::path::{Path, PathBuf};
 
@@ -8,8 +7,12 @@ use ndarray::Array3;
 use png::{BitDepth, ColorType, Transformations};
 use rcwm_models::IMAGE_SIDE;
 use rcwm_models::episode::robot_above;
+use rcwm_models::files::open_capped;
 
 use super::load::{LoadError, is, sorted};
+
+/// Largest picture of a mask that is read, in bytes.
+const MASK_BYTES_MAX: u64 = 16 << 20;
 
 /// A picture's pixels: how bright, or the number of an object; and how opaque, where that is told.
 struct Picture {
@@ -129,7 +132,7 @@ fn digits(path: &Path) -> Vec<u64> {
 
 /// Reads a picture as it is stored: a palette's indices stay what they are.
 fn decode(path: &Path) -> Result<Picture, String> {
-    let file = File::open(path).map_err(|error| error.to_string())?;
+    let (file, _) = open_capped(path, MASK_BYTES_MAX).map_err(|error| error.to_string())?;
     let mut decoder = png::Decoder::new(BufReader::new(file));
     decoder.set_transformations(Transformations::IDENTITY);
     let mut reader = decoder.read_info().map_err(|error| error.to_string())?;
@@ -184,6 +187,7 @@ fn unpack(row: &[u8], depth: BitDepth) -> Vec<u32> {
 #[cfg(test)]
 mod tests {
     use super::*;
+    use std::fs::File;
 
     const PIXELS: usize = IMAGE_SIDE * IMAGE_SIDE;
 
