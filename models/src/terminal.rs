@@ -1,6 +1,8 @@
 //! What programs say on standard output and standard error. A pipe that was closed (`| head`) or a full disk never ends a program:
-//! `println!` would panic. What standard output has lost is told at the end, by [`finish`].
+//! `println!` would panic. What standard output has lost is told at the end, by [`finish`]. Names and texts come from other people's files:
+//! what would command the terminal is shown instead.
 
+use std::borrow::Cow;
 use std::fmt::Arguments;
 use std::io::{self, Write};
 use std::sync::atomic::{AtomicBool, AtomicI32, Ordering};
@@ -39,7 +41,7 @@ pub fn print(text: Arguments<'_>) {
         return;
     }
     let mut out = io::stdout().lock();
-    match out.write_fmt(text).and_then(|()| out.flush()) {
+    match out.write_all(shown(&text.to_string()).as_bytes()).and_then(|()| out.flush()) {
         Ok(()) => {}
         Err(error) if error.kind() == io::ErrorKind::BrokenPipe => CLOSED.store(true, Ordering::Relaxed),
         Err(error) => {
@@ -53,7 +55,22 @@ pub fn print(text: Arguments<'_>) {
 /// Prints to standard error, as `eprint!` does; for [`errln!`](crate::errln). There is nowhere to tell that it was lost.
 pub fn print_error(text: Arguments<'_>) {
     // One write a line, so that lines of several programs do not mix.
-    let _ = io::stderr().write_all(text.to_string().as_bytes());
+    let _ = io::stderr().write_all(shown(&text.to_string()).as_bytes());
+}
+
+/// The text with every control character but line ends and tabs written out, such as `\u{1b}` for the one that begins a terminal's
+/// commands.
+#[must_use]
+pub fn shown(text: &str) -> Cow<'_, str> {
+    let commands = |c: char| c.is_control() && c != '\n' && c != '\t';
+    if !text.contains(commands) {
+        return Cow::Borrowed(text);
+    }
+    let show = |mut shown: String, c: char| {
+        if commands(c) { shown.extend(c.escape_unicode()) } else { shown.push(c) }
+        shown
+    };
+    Cow::Owned(text.chars().fold(String::with_capacity(text.len() + 16), show))
 }
 
 /// Whether all that was printed has arrived, or nobody wanted it any more; to be asked at the end of a program.
@@ -184,6 +201,12 @@ fn duration(seconds: f64) -> String {
 #[cfg(test)]
 mod tests {
     use super::*;
+
+    #[test]
+    fn what_would_command_a_terminal_is_written_out() {
+        let name = "a\tred \u{1b}[31mlog\r\u{9b}2J, ünï\n";
+        assert_eq!(shown(name), "a\tred \\u{1b}[31mlog\\u{d}\\u{9b}2J, ünï\n");
+    }
 
     #[test]
     fn a_line_of_progress_tells_how_far_how_fast_and_how_long() {

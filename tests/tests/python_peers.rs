@@ -1,5 +1,9 @@
 //! The wire spoken from Python (`runtime/examples/python`), on either side.
 
+use std::process::Command;
+use std::time::Duration;
+
+use rcwm_models::wire::{Action, ControllerLink, Wait};
 use rcwm_tests::{Domain, Running, output, read_json, root, shipped_bundle};
 
 #[test]
@@ -51,7 +55,7 @@ fn a_python_simulator_is_driven_by_the_runtime() {
     simulator.succeed();
     runtime.succeed();
     let (left, right) = (read_json(&left), read_json(&right));
-    assert_eq!((&left["answers"], &left["actions_out_of_range"]), (&60.into(), &0.into()));
+    assert_eq!((&left["answers"], &left["actions_refused"]), (&60.into(), &0.into()));
     assert_eq!(right["whole_episodes"], 2);
     assert_eq!(right["episodes"][0]["task"], "own");
     assert_eq!(domain.leftovers(), Vec::<String>::new());
@@ -71,4 +75,41 @@ fn a_python_robot_is_told_that_its_controller_has_closed() {
     assert!(said.contains("the controller has closed"), "{said}");
     // And no other came.
     assert!(!simulator.status.success() && said.contains("no answer"), "{said}");
+}
+
+#[test]
+fn a_python_robot_executes_no_action_that_is_not_finite_or_out_of_range() {
+    let (domain, folder) = (Domain::new(), tempfile::tempdir().unwrap());
+    let left = folder.path().join("simulator.json");
+    let controller = ControllerLink::open(domain.link("python")).unwrap();
+    let mut command = domain.python(&root().join("runtime/examples/python/simulator.py"));
+    command.args(["--instance", "python", "--episodes", "1", "--steps", "3", "--json"]).arg(&left);
+    let mut simulator = Running::start(command);
+    let mut answers = 0;
+    while let Wait::Message(observation) = controller.wait_observation(Duration::from_secs(20)).unwrap() {
+        // The robot waits on: the next one may be fit.
+        for bad in [f32::NAN, f32::INFINITY, 1.5, 0.5] {
+            let action = [0.0, bad, 0.0, 0.0];
+            let answers = observation.sequence;
+            controller.send(Action { answers, published_ns: 0, source: 0, reserved: 0, action }).unwrap();
+            // Only the newest action is kept: each is to be seen.
+            std::thread::sleep(Duration::from_millis(20));
+        }
+        answers += 1;
+    }
+    simulator.succeed();
+    let left = read_json(&left);
+    assert_eq!((&left["answers"], &left["total_reward"].is_number()), (&answers.into(), &true), "{left}");
+    assert!(left["actions_refused"].as_u64().unwrap() >= 3, "{left}");
+}
+
+#[test]
+fn a_python_controller_sends_no_action_that_is_not_finite() {
+    let domain = Domain::new();
+    let script = "import rcwm_link as r; l = r.ControllerLink('python'); o = r.Observation();\n\
+                  for bad in ('nan', 'inf', '-inf'):\n try: l.act(o, [0, 0, float(bad), 0]); print('sent')\n except ValueError: print('refused')";
+    let mut command: Command = domain.python("-c".as_ref());
+    command.arg(script).env("PYTHONPATH", root().join("runtime/examples/python"));
+    let told = output(command);
+    assert_eq!(String::from_utf8_lossy(&told.stdout), "refused\n".repeat(3), "{told:?}");
 }

@@ -4,7 +4,7 @@
 
 use std::process::{Command, Output};
 
-use rcwm_tests::{Domain, binary, shipped_bundle};
+use rcwm_tests::{Domain, binary, python, root, shipped_bundle};
 
 /// Runs a script in a namespace whose shared memory is of so many KiB; none where the system grants no namespace.
 fn with_memory(kib: u32, domain: &Domain, script: &str) -> Option<Output> {
@@ -20,6 +20,7 @@ fn with_memory(kib: u32, domain: &Domain, script: &str) -> Option<Output> {
     let mut command = Command::new("unshare");
     command.args(flags).args(["sh", "-c", &format!("{mount} && {script}")]);
     command.env("RCWM_PREFIX", domain.prefix()).env("BUNDLE", shipped_bundle());
+    command.env("PYTHON", python()).env("EXAMPLES", root().join("runtime/examples/python"));
     command.env("RUNTIME", binary("rcwm-runtime")).env("SIMULATOR", binary("rcwm-simulator"));
     Some(command.output().unwrap())
 }
@@ -28,7 +29,11 @@ fn with_memory(kib: u32, domain: &Domain, script: &str) -> Option<Output> {
 fn a_full_shared_memory_is_one_line_with_the_remedy() {
     let run = "$RUNTIME run --bundle $BUNDLE --instance a --timeout 0.3";
     let serve = "$SIMULATOR serve --task reach --instance a --episodes 1 --wait-controller 1";
-    for (program, kib) in [(run, 4), (run, 16), (run, 40), (serve, 4), (serve, 64), (serve, 400)] {
+    let python_run = "$PYTHON $EXAMPLES/controller.py --instance a --timeout-s 0.3";
+    let python_serve = "$PYTHON $EXAMPLES/simulator.py --instance a --episodes 1 --timeout-s 1";
+    let rust = [(run, 4), (run, 16), (run, 40), (serve, 4), (serve, 64), (serve, 400)];
+    let python = [(python_run, 16), (python_run, 40), (python_serve, 64), (python_serve, 400)];
+    for (program, kib) in rust.into_iter().chain(python) {
         let domain = Domain::new();
         let Some(output) = with_memory(kib, &domain, program) else { return };
         let text = String::from_utf8_lossy(&output.stderr);

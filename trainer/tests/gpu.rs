@@ -251,7 +251,7 @@ fn sizes_that_kernels_do_not_take_are_refused_by_name() {
 #[test]
 fn programs_give_the_authors_numbers() {
     let file = std::path::Path::new(env!("CARGO_MANIFEST_DIR")).join("../tests/data/rcwm-small.safetensors");
-    let report = parity::check_programs(&file, &Group::ALL, Machine::host()).unwrap();
+    let report = parity::check_programs(&file, &Group::ALL, Machine::host(), &mut |_| ()).unwrap();
     assert_eq!(report.groups.len(), 6);
     for group in &report.groups {
         assert!(group.passes(), "{}: {:?}", group.group.as_str(), group.worst());

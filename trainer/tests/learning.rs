@@ -29,7 +29,7 @@ const BLIND: &str = "interaction.key.bias";
 #[test]
 fn one_update_of_the_authors_implementation_is_ours_in_every_number() {
     let file = Path::new(env!("CARGO_MANIFEST_DIR")).join("../tests/data/rcwm-small.safetensors");
-    let report = parity::check_file(&file, &Group::ALL, &Device::Cpu).unwrap();
+    let report = parity::check_file(&file, &Group::ALL, &Device::Cpu, &mut |_| ()).unwrap();
     for group in &report.groups {
         assert!(group.passes(), "{}: {:?}", group.group.as_str(), group.worst());
     }

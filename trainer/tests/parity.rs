@@ -21,7 +21,7 @@ fn change_one_weight(reference: &mut Reference, name: &str, change: f32) {
 
 #[test]
 fn every_group_agrees_with_the_reference() {
-    let report = parity::check(&reference(), &Group::ALL, &Device::Cpu).unwrap();
+    let report = parity::check(&reference(), &Group::ALL, &Device::Cpu, &mut |_| ()).unwrap();
     for group in &report.groups {
         assert!(group.passes(), "{:?}", group.worst());
     }
@@ -31,7 +31,7 @@ fn every_group_agrees_with_the_reference() {
 
 #[test]
 fn what_is_not_computed_is_listed_and_not_passed() {
-    let report = parity::check(&reference(), &[Group::Encoder], &Device::Cpu).unwrap();
+    let report = parity::check(&reference(), &[Group::Encoder], &Device::Cpu, &mut |_| ()).unwrap();
     let left = |prefix: &str| {
         report
             .unchecked
@@ -43,7 +43,7 @@ fn what_is_not_computed_is_listed_and_not_passed() {
         (left("encoder"), left("observe"), left("grad"), left("loss")),
         (None, Some(13), Some(106), Some(13))
     );
-    assert!(!parity::check(&reference(), &[], &Device::Cpu).unwrap().passes());
+    assert!(!parity::check(&reference(), &[], &Device::Cpu, &mut |_| ()).unwrap().passes());
 }
 
 #[test]
@@ -62,7 +62,7 @@ fn one_changed_weight_of_any_part_fails_its_group() {
     ] {
         let mut reference = reference();
         change_one_weight(&mut reference, &format!("weights/{weight}"), 0.02);
-        let report = parity::check(&reference, &[group], &Device::Cpu).unwrap();
+        let report = parity::check(&reference, &[group], &Device::Cpu, &mut |_| ()).unwrap();
         assert!(!report.passes(), "{weight} is not seen by {group:?}");
     }
 }
@@ -71,7 +71,7 @@ fn one_changed_weight_of_any_part_fails_its_group() {
 fn weights_that_are_not_finite_are_refused_by_name() {
     let mut reference = reference();
     change_one_weight(&mut reference, "weights/actor.out.bias", f32::NAN);
-    match parity::check(&reference, &[Group::Actor], &Device::Cpu) {
+    match parity::check(&reference, &[Group::Actor], &Device::Cpu, &mut |_| ()) {
         Err(ParityError::Parameters(error)) => {
             assert!(error.to_string().contains("actor.out.bias"), "{error}")
         }
@@ -84,7 +84,7 @@ fn a_reference_of_other_sizes_than_its_weights_is_refused() {
     let mut reference = reference();
     reference.settings.units = 33;
     assert!(matches!(
-        parity::check(&reference, &[Group::Actor], &Device::Cpu),
+        parity::check(&reference, &[Group::Actor], &Device::Cpu, &mut |_| ()),
         Err(ParityError::Parameters(_))
     ));
 }

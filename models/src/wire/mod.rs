@@ -21,6 +21,6 @@ mod messages;
 
 pub use link::{
     ActionObserverLink, ControllerLink, Events, LinkError, LinkSettings, ObservationSample, ObservationSlot,
-    ObserverLink, SimulatorLink, Wait, forget_prefix, list_leftovers, shared_memory_number,
+    ObserverLink, SimulatorLink, Wait, forget_prefix, list_leftovers, say_closed_for, shared_memory_number,
 };
 pub use messages::{ACTION_MAX, Action, ActionSource, Observation, ObservationFlags};

@@ -10,7 +10,7 @@ import argparse
 import json
 import random
 
-from rcwm_link import FIRST, LAST, REPEATED, SUCCESS, ControllerLink, Observation, PeerClosed
+from rcwm_link import FIRST, LAST, REPEATED, SUCCESS, ControllerLink, Observation, PeerClosed, SharedMemoryFull
 
 
 def decide(observation: Observation, generator: random.Random) -> list[float]:
@@ -27,7 +27,10 @@ def main() -> None:
     options = parser.parse_args()
 
     generator = random.Random(options.seed)
-    link = ControllerLink(options.instance)
+    try:
+        link = ControllerLink(options.instance)
+    except SharedMemoryFull as error:
+        raise SystemExit(str(error)) from None
     counts = {"observations": 0, "episodes": 0, "repeated": 0, "gaps": 0, "total_reward": 0.0, "success": False}
     last_sequence, action = None, [0.0] * 4
     try:

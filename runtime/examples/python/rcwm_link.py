@@ -6,6 +6,8 @@ version is refused when it connects.
 """
 
 import ctypes
+import errno
+import math
 import os
 import time
 
@@ -64,13 +66,54 @@ class PeerClosed(Exception):
     """The other side said that it closes: a controller sends no further action, a simulator no further observation."""
 
 
+# Messages that a publisher keeps room for, and some more; and the bytes of everything else.
+_PAYLOADS, _OVERHEAD = 28, 64 << 10
+
+
+class SharedMemoryFull(OSError):
+    """No room in /dev/shm: said before anything is written, as the first write to a page without room ends a process by SIGBUS."""
+
+
+def _check_room(needed: int) -> None:
+    shared = os.statvfs("/dev/shm")
+    free = shared.f_bavail * shared.f_frsize
+    if free < needed:
+        raise SharedMemoryFull(
+            f"shared memory is full: /dev/shm has {free >> 10} KiB free and {needed >> 10} are needed; remove files there, "
+            "or give the container more (--shm-size)"
+        )
+
+
+def _own_files(prefix: str) -> set[str]:
+    entries = os.scandir("/dev/shm")
+    return {entry.path for entry in entries if entry.name.startswith(prefix) and entry.stat().st_uid == os.geteuid()}
+
+
+def _reserve(paths: set[str]) -> None:
+    """Takes the room of files for good, so that no later write can find none."""
+    for path in paths:
+        try:
+            descriptor = os.open(path, os.O_RDWR)
+        except OSError:  # a peer has removed its own
+            continue
+        try:
+            os.posix_fallocate(descriptor, 0, max(1, os.fstat(descriptor).st_size))
+        except OSError as error:
+            if error.errno == errno.ENOSPC:
+                _check_room(1 << 62)
+        finally:
+            os.close(descriptor)
+
+
 class _Link:
-    def __init__(self, instance: str):
+    def __init__(self, instance: str, receives: tuple[str, type], sends: tuple[str, type]):
+        _check_room(_PAYLOADS * ctypes.sizeof(sends[1]) + _OVERHEAD)
         iox2.set_log_level_from_env_or(iox2.LogLevel.Error)
         config = iox2.config.default()
         prefix = os.environ.get("RCWM_PREFIX")
         if prefix:
             config.global_cfg.prefix = iox2.FileName.new(prefix)
+        before = _own_files(prefix or "iox2_")
         self._node = (
             iox2.NodeBuilder.new()
             .config(config)
@@ -79,6 +122,13 @@ class _Link:
         )
         self._instance = instance
         self._seen: set[int] = set()
+        received, awaited = self._direction(*receives)
+        sent, woken = self._direction(*sends)
+        self._subscriber = received.subscriber_builder().create()
+        self._listener = awaited.listener_builder().create()
+        self._publisher = sent.publisher_builder().create()
+        self._notifier = woken.notifier_builder().create()
+        _reserve(_own_files(prefix or "iox2_") - before)
 
     def _direction(self, topic: str, message: type):
         name = iox2.ServiceName.new(f"rcwm/{self._instance}/{topic}")
@@ -142,13 +192,7 @@ class ControllerLink(_Link):
     """A controller's end: observations in, actions out."""
 
     def __init__(self, instance: str):
-        super().__init__(instance)
-        observation_data, observation_event = self._direction("observation", Observation)
-        action_data, action_event = self._direction("action", Action)
-        self._subscriber = observation_data.subscriber_builder().create()
-        self._listener = observation_event.listener_builder().create()
-        self._publisher = action_data.publisher_builder().create()
-        self._notifier = action_event.notifier_builder().create()
+        super().__init__(instance, receives=("observation", Observation), sends=("action", Action))
         # The simulator publishes its current observation again for a controller that has just connected.
         self._notify(_HELLO)
 
@@ -166,9 +210,12 @@ class ControllerLink(_Link):
                 return None
 
     def act(self, observation: Observation, action, source: str = "policy") -> None:
-        """Answers an observation with four numbers in [-1, 1]."""
+        """Answers an observation with four numbers, clamped to [-1, 1]. Raises ValueError, and sends nothing, where one is not finite."""
+        values = [float(value) for value in action]
+        if not all(map(math.isfinite, values)):
+            raise ValueError(f"an action that is not finite is not sent: {values}")
         answer = Action(answers=observation.sequence, source=SOURCES.index(source))
-        answer.action[:] = [min(1.0, max(-1.0, float(value))) for value in action]
+        answer.action[:] = [min(1.0, max(-1.0, value)) for value in values]
         self._send(answer)
 
 
@@ -176,18 +223,15 @@ class SimulatorLink(_Link):
     """A simulator's or robot's end: observations out, actions in."""
 
     def __init__(self, instance: str):
-        super().__init__(instance)
-        observation_data, observation_event = self._direction("observation", Observation)
-        action_data, action_event = self._direction("action", Action)
-        self._subscriber = action_data.subscriber_builder().create()
-        self._listener = action_event.listener_builder().create()
-        self._publisher = observation_data.publisher_builder().create()
-        self._notifier = observation_event.notifier_builder().create()
+        super().__init__(instance, receives=("action", Action), sends=("observation", Observation))
+        #: Actions that were not finite or not within [-1, 1], and were not returned.
+        self.refused = 0
 
     def step(self, observation: Observation, timeout_s: float) -> Action | None:
         """Publishes an observation and waits for the action that answers it (lock-step).
 
-        A controller that connects in the meantime gets the observation again. None when the time is up. Raises PeerClosed
+        A controller that connects in the meantime gets the observation again. An answer that a robot must not execute is
+        counted in `refused` and not returned. None when the time is up. Raises PeerClosed
         when the controller has said that it ends and no answer has come: bring the robot to rest. Calling this again with
         the same observation waits for the next controller.
         """
@@ -196,7 +240,10 @@ class SimulatorLink(_Link):
         while True:
             action = self._receive(max(0.0, deadline - time.monotonic()))
             if action is not None and action.answers == observation.sequence:
-                return action
+                # NaN is within nothing.
+                if all(-1.0 <= value <= 1.0 for value in action.action):
+                    return action
+                self.refused += 1
             if action is None and _CLOSED in self._seen:
                 self._seen.clear()
                 observation.flags |= REPEATED

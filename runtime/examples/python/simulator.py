@@ -13,7 +13,7 @@ import math
 import random
 import sys
 
-from rcwm_link import FIRST, IMAGE_SIDE, LAST, OWN_TASK, SUCCESS, Observation, PeerClosed, SimulatorLink
+from rcwm_link import FIRST, IMAGE_SIDE, LAST, OWN_TASK, SUCCESS, Observation, PeerClosed, SharedMemoryFull, SimulatorLink
 
 
 class Table:
@@ -59,8 +59,11 @@ def main() -> None:
     options = parser.parse_args()
 
     generator = random.Random(options.seed)
-    link = SimulatorLink(options.instance)
-    counts = {"observations": 0, "answers": 0, "total_reward": 0.0, "actions_out_of_range": 0}
+    try:
+        link = SimulatorLink(options.instance)
+    except SharedMemoryFull as error:
+        raise SystemExit(str(error)) from None
+    counts = {"observations": 0, "answers": 0, "total_reward": 0.0, "actions_refused": 0}
     try:
         for episode in range(options.episodes):
             table, action, reward = Table(generator), [0.0] * 4, 0.0
@@ -76,12 +79,12 @@ def main() -> None:
                     raise SystemExit(f"no answer on {options.instance!r} within {options.timeout_s} s: is a controller running?")
                 counts["answers"] += 1
                 action = list(answer.action)
-                counts["actions_out_of_range"] += any(not abs(value) <= 1.0 for value in action)
                 reward = table.move(action)
                 counts["total_reward"] += reward
             print(f"episode {episode}: {options.steps} observations answered")
     finally:
         link.close()
+    counts["actions_refused"] = link.refused
     if options.json:
         with open(options.json, "w", encoding="utf-8") as file:
             json.dump(counts, file)

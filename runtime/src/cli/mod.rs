@@ -209,15 +209,30 @@ fn write_json(path: Option<&Path>, report: &impl Serialize) -> anyhow::Result<()
 
 /// Signals this close together are one: supervisors and `timeout` signal a process, then its whole group.
 const ONE_SIGNAL: Duration = Duration::from_millis(300);
+/// Time for what is done before the process ends at once.
+const LAST_DEED: Duration = Duration::from_secs(1);
 
 /// A flag that Ctrl-C or SIGTERM sets; a second one, later, ends the process at once.
 fn stop_flag() -> anyhow::Result<Arc<AtomicBool>> {
+    stop_flag_after(|| ())
+}
+
+/// The same; before a second signal ends the process, `last` is done, for which there is a second.
+fn stop_flag_after(last: impl Fn() + Clone + Send + 'static) -> anyhow::Result<Arc<AtomicBool>> {
     let stop = Arc::new(AtomicBool::new(false));
     let flag = Arc::clone(&stop);
     let mut first: Option<Instant> = None;
     ctrlc::set_handler(move || {
         flag.store(true, Ordering::Relaxed);
         if first.get_or_insert_with(Instant::now).elapsed() > ONE_SIGNAL {
+            let (done, is_done) = std::sync::mpsc::channel();
+            let last = last.clone();
+            std::thread::spawn(move || {
+                last();
+                done.send(())
+            });
+            // What takes longer, or panics, is not waited for.
+            let _ = is_done.recv_timeout(LAST_DEED);
             std::process::exit(i32::from(Exit::AtOnce as u8));
         }
     })

@@ -7,7 +7,7 @@ use std::time::Duration;
 use anyhow::Context;
 use clap::Args;
 use rcwm_models::bundle::Bundle;
-use rcwm_models::wire::LinkSettings;
+use rcwm_models::wire::{LinkSettings, say_closed_for};
 
 use super::observers::{ObserverArguments, Observers, note};
 use super::safety::{SafetyArguments, TimeArguments};
@@ -76,7 +76,11 @@ pub(super) struct RunArguments {
 
 pub(super) fn run(arguments: &RunArguments) -> anyhow::Result<()> {
     arguments.observers.prepare(arguments.json.as_deref())?;
-    let stop = super::stop_flag()?;
+    let link = LinkSettings::new(&arguments.instance);
+    let stop = super::stop_flag_after(move || {
+        // The loop may be stuck. Where the robot cannot be told, nobody is left to hear why.
+        let _ = say_closed_for(&link);
+    })?;
     let bundle = super::open_bundle(&arguments.bundle)?;
     let engine = EngineSettings::chosen(arguments.engine, arguments.threads, arguments.half_weights)?;
     let sampling = match arguments.sample {

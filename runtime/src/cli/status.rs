@@ -139,7 +139,7 @@ fn draw(messages: &Receiver<Message>, waiting: String) {
             }
             Message::Status(text) => bar.set_message(text),
             Message::Line(text) if bar.is_hidden() => rcwm_models::errln!("{text}"),
-            Message::Line(text) => bar.println(text),
+            Message::Line(text) => bar.println(rcwm_models::terminal::shown(&text)),
         }
     }
     bar.finish_and_clear();

@@ -18,6 +18,7 @@ use rcwm_models::terminal::Heartbeat;
 use rcwm_models::wire::{LinkSettings, SimulatorLink};
 use rcwm_simulator::environment::Environment;
 use rcwm_simulator::serve::{ServeSettings, serve};
+use rcwm_simulator::snapshot;
 use serde::Serialize;
 
 use cli::{Cli, Command, ServeArguments, TasksArguments};
@@ -44,7 +45,7 @@ fn run_serve(arguments: &ServeArguments) -> Result<()> {
     prepare_json(arguments.json.as_deref())?;
     let stop = stop_flag()?;
     if let Some(folder) = &arguments.snapshot {
-        std::fs::create_dir_all(folder).with_context(|| format!("creating {}", folder.display()))?;
+        snapshot::prepare(folder, &arguments.task).context("--snapshot")?;
     }
     let mut link = LinkSettings::new(&arguments.instance);
     link.spin = Duration::from_micros(arguments.spin_us);

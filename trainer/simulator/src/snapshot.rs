@@ -1,12 +1,13 @@
 //! Pictures of what was published, for people to look at.
 
+use std::fs;
 use std::io::Cursor;
 use std::path::{Path, PathBuf};
 
 use image::imageops::{FilterType, resize};
 use image::{ImageFormat, Rgb, RgbImage};
 use rcwm_models::IMAGE_SIDE;
-use rcwm_models::files::write_atomic;
+use rcwm_models::files::{FileError, write_atomic};
 use rcwm_models::wire::{Observation, ObservationFlags};
 
 use crate::SimulatorError;
@@ -15,6 +16,22 @@ use crate::SimulatorError;
 const ZOOM: u32 = 6;
 /// Width of the black gap between picture and mask, in pixels of the observation.
 const GAP: u32 = 2;
+
+/// Makes the folder, and makes sure that no picture of an earlier run of this task would be written over.
+///
+/// # Errors
+/// [`SimulatorError::File`].
+pub fn prepare(folder: &Path, task: &str) -> Result<(), SimulatorError> {
+    let failed = |source| FileError::Io { path: folder.to_path_buf(), source };
+    let made = fs::create_dir_all(folder).and_then(|()| fs::read_dir(folder)?.collect::<Result<Vec<_>, _>>());
+    let begin = format!("{task}-e");
+    let is_picture = |name: &str| name.starts_with(&begin) && name.ends_with(".png");
+    let found = made.map_err(failed)?;
+    match found.iter().find(|entry| entry.file_name().to_str().is_some_and(is_picture)) {
+        Some(picture) => Err(FileError::Exists { path: picture.path() }.into()),
+        None => Ok(()),
+    }
+}
 
 /// Writes an observation as `DIR/<task>-e<episode>-s<step>.png`, with its mask beside it where there is one.
 ///
@@ -49,6 +66,17 @@ fn beside(observation: &Observation) -> RgbImage {
 #[cfg(test)]
 mod tests {
     use super::*;
+
+    #[test]
+    fn pictures_of_an_earlier_run_are_not_written_over() {
+        let folder = tempfile::tempdir().unwrap();
+        let pictures = folder.path().join("pictures");
+        prepare(&pictures, "reach").unwrap();
+        let first = write(&pictures, "reach", &Observation::zeroed()).unwrap();
+        prepare(&pictures, "reach-wall").unwrap();
+        let error = prepare(&pictures, "reach").unwrap_err().to_string();
+        assert!(error.contains(&first.display().to_string()), "{error}");
+    }
 
     #[test]
     fn picture_and_mask_lie_beside_each_other_the_first_row_on_top() {

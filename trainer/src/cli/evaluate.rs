@@ -35,7 +35,7 @@ use super::report::{Inputs, ReportArguments};
   rcwm-trainer evaluate --checkpoint runs/hammer/checkpoints/best --task hammer --episodes 20
   rcwm-trainer evaluate --bundle bundles/hammer --task hammer --episodes 20 --disturb textures \\
       --simulators 2
-  rcwm-trainer evaluate --report report --bundles models/bundles --episodes 50 --checkpoint \
+  rcwm-trainer evaluate --report report --bundles models/bundles --episodes 50 --checkpoint \\
       runs/small/checkpoints/last --checkpoint runs/vanilla/checkpoints/last --data data/unseen
   rcwm-trainer evaluate --report report        (draws the page anew)
 

@@ -2,7 +2,7 @@ use std::path::PathBuf;
 use std::process::ExitCode;
 
 use anyhow::Result;
-use rcwm_trainer::parity::{self, Group, Measure, Report};
+use rcwm_trainer::parity::{self, Group, GroupReport, Measure, Report};
 use rcwm_trainer::training::Compute;
 use serde::Serialize;
 
@@ -42,21 +42,25 @@ impl Parity {
         super::prepare_json(self.json.as_deref())?;
         let groups = if self.groups.is_empty() { Group::ALL.to_vec() } else { self.groups.clone() };
         let report = match self.compute.compute()? {
-            Compute::Tensors(device) => parity::check_file(&self.file, &groups, &device)?,
+            Compute::Tensors(device) => {
+                print_head();
+                parity::check_file(&self.file, &groups, &device, &mut print_group)?
+            }
             Compute::Programs(machine) => {
                 rcwm_models::outln!("updates by programs of kernels on {}", machine.name());
-                parity::check_programs(&self.file, &groups, machine)?
+                print_head();
+                parity::check_programs(&self.file, &groups, machine, &mut print_group)?
             }
         };
         if let Some(path) = &self.json {
             super::write_json(path, &Outcome { file: &self.file, passes: report.passes(), report: &report })?;
         }
-        print(&report);
+        print_end(&report);
         Ok(if report.passes() { ExitCode::SUCCESS } else { ExitCode::FAILURE })
     }
 }
 
-fn print(report: &Report) {
+fn print_head() {
     rcwm_models::outln!(
         "{:<17} {:>7} {:>10} {:>10}            worst tensor",
         "group",
@@ -64,22 +68,27 @@ fn print(report: &Report) {
         "max error",
         "tolerance"
     );
-    for group in &report.groups {
-        let worst = group.worst();
-        rcwm_models::outln!(
-            "{:<17} {:>7} {:>10.2e} {:>10.0e} {}  {:<5}  {}",
-            group.group.as_str(),
-            group.comparisons.len(),
-            worst.map_or(f32::NAN, |worst| worst.error_max),
-            group.tolerance,
-            match group.measure {
-                Measure::Absolute => "abs",
-                Measure::Relative => "rel",
-            },
-            if group.passes() { "ok" } else { "FAIL" },
-            worst.map_or("", |worst| worst.name.as_str()),
-        );
-    }
+}
+
+/// As soon as it is known: a group takes up to some minutes.
+fn print_group(group: &GroupReport) {
+    let worst = group.worst();
+    rcwm_models::outln!(
+        "{:<17} {:>7} {:>10.2e} {:>10.0e} {}  {:<5}  {}",
+        group.group.as_str(),
+        group.comparisons.len(),
+        worst.map_or(f32::NAN, |worst| worst.error_max),
+        group.tolerance,
+        match group.measure {
+            Measure::Absolute => "abs",
+            Measure::Relative => "rel",
+        },
+        if group.passes() { "ok" } else { "FAIL" },
+        worst.map_or("", |worst| worst.name.as_str()),
+    );
+}
+
+fn print_end(report: &Report) {
     for unchecked in &report.unchecked {
         rcwm_models::outln!("{:<17} {:>7} not checked", unchecked.prefix, unchecked.tensors);
     }

@@ -43,29 +43,47 @@ pub enum ParityError {
 ///
 /// # Errors
 /// See [`ParityError`]; a difference is no error but part of the report.
-pub fn check_file(path: &Path, groups: &[Group], device: &Device) -> Result<Report, ParityError> {
-    check(&Reference::read(path)?, groups, device)
+pub fn check_file(
+    path: &Path,
+    groups: &[Group],
+    device: &Device,
+    done: &mut dyn FnMut(&GroupReport),
+) -> Result<Report, ParityError> {
+    check(&Reference::read(path)?, groups, device, done)
 }
 
-/// Compares a reference file with the updates that programs make on `machine`: the groups from [`Group::Loss`] on.
+/// Compares a reference file with the updates that programs make on `machine`: the groups from [`Group::Loss`] on,
+/// each of which `done` hears of.
 ///
 /// # Errors
 /// See [`ParityError`]; a difference is no error but part of the report.
-pub fn check_programs(path: &Path, groups: &[Group], machine: Machine) -> Result<Report, ParityError> {
+pub fn check_programs(
+    path: &Path,
+    groups: &[Group],
+    machine: Machine,
+    done: &mut dyn FnMut(&GroupReport),
+) -> Result<Report, ParityError> {
     let reference = Reference::read(path)?;
     let made = programs::Programs::new(&reference, machine)?;
     let mut reports = Vec::new();
     for group in groups.iter().filter(|group| **group > Group::Behaviour) {
-        reports.push(compare(&reference, *group, made.compute(*group)?)?);
+        let report = compare(&reference, *group, made.compute(*group)?)?;
+        done(&report);
+        reports.push(report);
     }
     Ok(Report::new(&reference, reports))
 }
 
-/// Compares a reference with our model, group by group.
+/// Compares a reference with our model, group by group, each of which `done` hears of.
 ///
 /// # Errors
 /// See [`ParityError`]; a difference is no error but part of the report.
-pub fn check(reference: &Reference, groups: &[Group], device: &Device) -> Result<Report, ParityError> {
+pub fn check(
+    reference: &Reference,
+    groups: &[Group],
+    device: &Device,
+    done: &mut dyn FnMut(&GroupReport),
+) -> Result<Report, ParityError> {
     let mut forward = forward::Forward::new(reference, device)?;
     let mut updates = None;
     let mut reports = Vec::new();
@@ -77,7 +95,9 @@ pub fn check(reference: &Reference, groups: &[Group], device: &Device) -> Result
             let made = updates.take().map_or_else(|| updates::Updates::new(reference, device), Ok)?;
             updates.insert(made).compute(*group)?
         };
-        reports.push(compare(reference, *group, found)?);
+        let report = compare(reference, *group, found)?;
+        done(&report);
+        reports.push(report);
     }
     Ok(Report::new(reference, reports))
 }

@@ -6,7 +6,7 @@ use std::time::Duration;
 use iceoryx2::prelude::Node;
 
 use super::direction::{Direction, EVENT_CLOSED, EVENT_HELLO, EVENT_PUBLISHED, Received, Receiver, Sender};
-use super::domain::join;
+use super::domain::{join, make_node};
 use super::error::traffic;
 use super::{Ipc, LinkError, LinkSettings, Wait};
 use crate::wire::clock::monotonic_ns;
@@ -117,6 +117,15 @@ impl ControllerLink {
     pub fn close(self) -> Result<(), LinkError> {
         self.say_closed()
     }
+}
+
+/// Tells the simulator of an instance that no further action will come, on behalf of a controller whose own thread is stuck.
+///
+/// # Errors
+/// See [`LinkError`].
+pub fn say_closed_for(settings: &LinkSettings) -> Result<(), LinkError> {
+    let node = make_node(settings)?;
+    Direction::<Action>::open(&node, &settings.instance, "action")?.waker()?.notify(EVENT_CLOSED)
 }
 
 impl Drop for ControllerLink {

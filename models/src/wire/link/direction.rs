@@ -88,11 +88,15 @@ impl<T: ZeroCopySend + std::fmt::Debug + 'static> Direction<T> {
                 ExceedsMaxSupportedPublishers => LinkError::Taken { service: self.name.clone(), role },
                 other => LinkError::Service { service: self.name.clone(), reason: format!("{other:?}") },
             })?;
-        let notifier = self.event.notifier_builder().create().map_err(|error| LinkError::Service {
+        Ok(Sender { publisher, waker: self.waker()? })
+    }
+
+    pub(super) fn waker(&self) -> Result<Waker, LinkError> {
+        let created = self.event.notifier_builder().create();
+        created.map(Waker).map_err(|error| LinkError::Service {
             service: self.name.clone(),
             reason: format!("{error:?}"),
-        })?;
-        Ok(Sender { publisher, notifier })
+        })
     }
 
     pub(super) fn receiver(&self) -> Result<Receiver<T>, LinkError> {
@@ -107,15 +111,22 @@ impl<T: ZeroCopySend + std::fmt::Debug + 'static> Direction<T> {
 
 pub(super) struct Sender<T: ZeroCopySend + std::fmt::Debug + 'static> {
     pub(super) publisher: Publisher<Ipc, T, ()>,
-    notifier: Notifier<Ipc>,
+    waker: Waker,
 }
 
 impl<T: ZeroCopySend + std::fmt::Debug + 'static> Sender<T> {
     pub(super) fn notify(&self, event: usize) -> Result<(), LinkError> {
-        self.notifier
-            .notify_with_custom_event_id(EventId::new(event))
-            .map(drop)
-            .map_err(traffic("waking the peer"))
+        self.waker.notify(event)
+    }
+}
+
+/// Wakes whoever listens at the other end.
+pub(super) struct Waker(Notifier<Ipc>);
+
+impl Waker {
+    pub(super) fn notify(&self, event: usize) -> Result<(), LinkError> {
+        let sent = self.0.notify_with_custom_event_id(EventId::new(event));
+        sent.map(drop).map_err(traffic("waking the peer"))
     }
 }
 

@@ -14,7 +14,7 @@ mod simulator;
 
 use std::time::Duration;
 
-pub use controller::{ControllerLink, ObservationSample};
+pub use controller::{ControllerLink, ObservationSample, say_closed_for};
 pub use domain::{forget_prefix, list_leftovers};
 pub use error::LinkError;
 pub use memory::shared_memory_number;
@@ -138,6 +138,16 @@ mod tests {
         };
         assert_eq!(observation.sequence, 9);
         assert!(matches!(controller.wait_observation(SOON).unwrap(), Wait::Closed));
+    }
+
+    #[test]
+    fn another_thread_tells_the_simulator_for_a_controller_that_is_stuck() {
+        let (settings, _domain) = domain("stuck");
+        let simulator = SimulatorLink::open(settings.clone()).unwrap();
+        let _stuck = ControllerLink::open(settings.clone()).unwrap();
+        simulator.poll_events().unwrap();
+        say_closed_for(&settings).unwrap();
+        assert!(matches!(simulator.wait_action(SOON).unwrap().0, Wait::Closed));
     }
 
     #[test]
