@@ -67,7 +67,11 @@ pub fn shown(text: &str) -> Cow<'_, str> {
         return Cow::Borrowed(text);
     }
     let show = |mut shown: String, c: char| {
-        if commands(c) { shown.extend(c.escape_unicode()) } else { shown.push(c) }
+        if commands(c) {
+            shown.extend(c.escape_unicode())
+        } else {
+            shown.push(c)
+        }
         shown
     };
     Cow::Owned(text.chars().fold(String::with_capacity(text.len() + 16), show))

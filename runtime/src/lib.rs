@@ -35,7 +35,7 @@
 //! # Ok::<(), rcwm_runtime::PolicyError>(())
 //! ```
 //!
-//! In a program of its own that has a rate to keep: [`realtime::keep_memory`] first thing in `main`, [`Policy::expect_image`] shortly before an image comes.
+//! In a program of its own that has a rate to keep: [`realtime::keep_memory`] first thing in `main`, [`Policy::prepare`] shortly before an image comes.
 //!
 //! This crate never links candle or Python.
 

@@ -93,31 +93,31 @@ fn one_thread_and_two_give_the_same_bits() {
 
 /// Getting ready computes on the last image; neither what is observed nor what is imagined after it may show a trace of that.
 #[test]
-fn a_rehearsal_changes_no_bit_of_what_follows() {
+fn warming_the_caches_changes_no_bit_of_what_follows() {
     let bundle = Bundle::open(&smallest_bundle()).unwrap();
     for threads in [1, 2] {
         let settings = with(Optimizations::EXACT).with_threads(threads);
-        let (mut plain, mut rehearsed) = (policy(&bundle, settings), policy(&bundle, settings));
+        let (mut plain, mut warmed) = (policy(&bundle, settings), policy(&bundle, settings));
         for step in 0..60 {
             let executed = [0.1, (step as f32).cos(), -0.4, 0.0];
-            let tick = |policy: &mut Policy, rehearses: bool| {
+            let tick = |policy: &mut Policy, warms_caches: bool| {
                 // Ahead for what is executed, or for something else; before or after getting ready.
                 let ahead = if step % 3 == 0 { [0.7; 4] } else { executed };
                 if step > 0 && step % 2 == 0 {
                     policy.work_ahead(Some(&ahead)).unwrap();
                 }
-                if rehearses {
-                    policy.expect_image();
+                if warms_caches {
+                    policy.warm_caches();
                 }
                 match step % 5 {
                     4 => policy.imagine(&executed).unwrap(),
                     _ => policy.observe(&image(step), (step > 0).then_some(&executed)).unwrap(),
                 }
             };
-            let (expected, found) = (tick(&mut plain, false), tick(&mut rehearsed, true));
+            let (expected, found) = (tick(&mut plain, false), tick(&mut warmed, true));
             assert_eq!(found.action.map(f32::to_bits), expected.action.map(f32::to_bits), "step {step}");
             assert_eq!((found.surprise, found.recomputed), (expected.surprise, expected.recomputed));
-            assert_eq!(rehearsed.state(), plain.state(), "step {step}");
+            assert_eq!(warmed.state(), plain.state(), "step {step}");
         }
     }
 }

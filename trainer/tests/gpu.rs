@@ -105,11 +105,11 @@ fn compare(
     preset: Preset,
     kind: ModelKind,
     masks: bool,
-    paint_every: usize,
+    decode_every: usize,
     tolerance: f32,
 ) {
     let model = ModelSettings::preset(preset, kind);
-    let world = WorldSettings { paint_every, ..WorldSettings::default() };
+    let world = WorldSettings { decode_every, ..WorldSettings::default() };
     let behaviour = BehaviourSettings {
         horizon: Horizon { length: 4, ..Horizon::default() },
         ..BehaviourSettings::default()
@@ -186,8 +186,8 @@ fn compare(
 #[test]
 fn programs_of_kernels_give_the_losses_gradients_and_weights_of_the_trainers_own_updates() {
     for kind in [ModelKind::Rcwm, ModelKind::Vanilla] {
-        for (masks, paint_every) in [(true, 1), (false, 3)] {
-            compare(Machine::host(), Preset::Debug, kind, masks, paint_every, 1e-4);
+        for (masks, decode_every) in [(true, 1), (false, 3)] {
+            compare(Machine::host(), Preset::Debug, kind, masks, decode_every, 1e-4);
         }
     }
 }
@@ -195,7 +195,7 @@ fn programs_of_kernels_give_the_losses_gradients_and_weights_of_the_trainers_own
 /// Gradients of an update on the host, by name, and how many commands it had.
 fn gradients_on(machine: Machine, kind: ModelKind) -> (BTreeMap<String, Vec<f32>>, usize) {
     let model = ModelSettings::preset(Preset::Debug, kind);
-    let world = WorldSettings { paint_every: 1, ..WorldSettings::default() };
+    let world = WorldSettings { decode_every: 1, ..WorldSettings::default() };
     let parameters = lively_parameters(&model);
     let mut gpu = GpuLearner::new(machine, &plan(&model, &world, None), &parameters).unwrap();
     gpu.update_world(&batch(ROWS, LENGTH, true, 0), numbered_noise(SEED, 0)).unwrap();
@@ -269,9 +269,9 @@ fn a_gpu_gives_what_the_host_gives() {
     };
     drop(machine);
     for kind in [ModelKind::Rcwm, ModelKind::Vanilla] {
-        for (masks, paint_every) in [(true, 1), (false, 3)] {
+        for (masks, decode_every) in [(true, 1), (false, 3)] {
             let machine = Machine::nvidia(0, Precision::F32).unwrap();
-            compare(machine, Preset::Debug, kind, masks, paint_every, 1e-4);
+            compare(machine, Preset::Debug, kind, masks, decode_every, 1e-4);
         }
         // The paper's sizes, too.
         let machine = Machine::nvidia(0, Precision::F32).unwrap();

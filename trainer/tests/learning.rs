@@ -312,11 +312,11 @@ fn the_cloning_loss_is_the_mean_over_examples_however_they_are_shared_out() {
 }
 
 #[test]
-fn steps_that_are_painted_take_turns_and_cover_all() {
+fn steps_that_are_decoded_take_turns_and_cover_all() {
     let model = ModelSettings::preset(Preset::Debug, ModelKind::Rcwm);
     let parameters = lively_parameters(&model);
     let image = |every: usize, number: u64| {
-        let settings = WorldSettings { paint_every: every, ..WorldSettings::default() };
+        let settings = WorldSettings { decode_every: every, ..WorldSettings::default() };
         let learner = WorldLearner::new(&parameters, &model, &settings, Trained::World).unwrap();
         let batch = Batch { number, ..batch(2, 6, true) };
         let losses = learner.losses(&batch, &mut Sampler::seeded(4)).unwrap().values().unwrap();

@@ -196,7 +196,7 @@ fn few_shot_learning_that_was_interrupted_in_any_stage_gives_the_same_weights() 
             settings.fewshot.imitation_scale = 10.0;
             settings.fewshot.starts = Starts::Episodes;
             settings.fewshot.shift = 2;
-            settings.world.paint_every = 2;
+            settings.world.decode_every = 2;
         }
         let source = pretrained(kind);
         let mut learning = Fewshot::create(&whole, settings.clone(), &source, &Device::Cpu).unwrap();

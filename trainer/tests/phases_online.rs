@@ -17,7 +17,7 @@ use rcwm_gpu::Machine;
 use rcwm_models::episode::Episode;
 use rcwm_models::settings::{ModelKind, Preset};
 use rcwm_models::wire::{LinkSettings, ObservationFlags, SimulatorLink, Wait};
-use rcwm_trainer::acting::{Policy, Seen, filter_step};
+use rcwm_trainer::acting::{Policy, PolicyInput, filter_step};
 use rcwm_trainer::checkpoint::Checkpoint;
 use rcwm_trainer::model::agent::Agent;
 use rcwm_trainer::model::latent::{FirstSteps, Sampler};
@@ -293,7 +293,8 @@ fn a_policy_that_is_not_finite_sends_zeros_and_says_so() {
     let agent = Agent::new(&checkpoint.parameters.frozen(), &checkpoint.settings.model).unwrap();
     let mut policy = Policy::new(agent, 2, &Device::Cpu);
     let image = vec![90; 64 * 64 * 3];
-    let seen = [0, 1].map(|simulator| Seen { simulator, first: true, image: &image, executed: [0.0; 4] });
+    let seen =
+        [0, 1].map(|simulator| PolicyInput { simulator, first: true, image: &image, executed: [0.0; 4] });
     let good = policy.decide(&seen, &mut Sampler::seeded(1)).unwrap();
     assert!(good.iter().all(|decision| !decision.refused && decision.action != [0.0; 4]));
     let poisoned = checkpoint.parameters.get("actor.out.bias").unwrap();

@@ -99,7 +99,7 @@ pub struct Times {
     pub world: Vec<Duration>,
     /// Updates of the behaviour, from the posteriors to the moved weights.
     pub behaviour: Vec<Duration>,
-    /// Flops a second of the yardstick, measured after each update.
+    /// Flops a second of the baseline, measured after each update.
     pub peaks: Vec<f64>,
     /// Largest resident memory of the process during the case, in bytes; 0 where the system does not tell.
     pub memory_bytes: u64,
@@ -173,7 +173,7 @@ pub fn host_batch(Scale { batch, length, .. }: Scale) -> HostBatch {
     }
 }
 
-/// The yardstick: a product whose right factor stays in the cache, on all threads, by the kernel that the updates use.
+/// The baseline: a product whose right factor stays in the cache, on all threads, by the kernel that the updates use.
 struct Peak {
     rows: Tensor,
     square: Tensor,

@@ -73,7 +73,7 @@ impl Control {
         Ok(control)
     }
 
-    /// Once unmeasured, as a tick is rehearsed, so that a second thread is awake; then once more.
+    /// Once unmeasured, as caches are warmed before a tick, so that a second thread is awake; then once more.
     pub(super) fn measure(&mut self) {
         if self.team.is_some() {
             self.run();

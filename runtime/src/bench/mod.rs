@@ -4,13 +4,13 @@
 //! from round to round. `tick` is image in, action out; what is worked ahead of the image is `ahead`, measured beside it. How much of the tails is the
 //! machine's own shows a control in the same rounds.
 
+mod ablation;
 mod control;
-mod ladder;
 mod limit;
 mod report;
 
+pub use ablation::{Case, ablation, engines};
 pub use control::ControlBench;
-pub use ladder::{Case, engines, ladder};
 pub use limit::{Limit, Machine, Stalls, measure_machine, measure_stalls};
 pub use report::{BenchReport, CaseBench, Step};
 
@@ -27,8 +27,8 @@ use crate::policy::{Policy, PolicyError, Sampling};
 use crate::realtime;
 use crate::telemetry::{Curve, LatencyFiles, PlotError, Stage, Telemetry, plot};
 
+use ablation::SINGLE;
 use control::Control;
-use ladder::SINGLE;
 
 /// Most ticks of the warm-up.
 const WARM_UP_MAX: usize = 2000;
@@ -135,7 +135,7 @@ fn make_controls(runners: &[Runner]) -> Result<Vec<Control>, BenchError> {
     settings.extend((deployed.threads > 1).then_some(deployed));
     let mut controls = Vec::new();
     for settings in settings {
-        let runs = |runner: &&Runner| runner.case.settings == settings && runner.case.rehearses;
+        let runs = |runner: &&Runner| runner.case.settings == settings && runner.case.warms_caches;
         if let Some(runner) = runners.iter().find(runs) {
             let p50_us = runner.warm_up.latency(Stage::Tick).p50_us;
             controls.push(Control::new(settings.threads, Duration::from_secs_f64(p50_us / 1e6))?);
@@ -212,8 +212,8 @@ impl Runner {
         self.policy.work_ahead(executed.as_ref())?;
         let ahead_ns = start.elapsed().as_nanos() as u64;
         let start = Instant::now();
-        if self.case.rehearses {
-            self.policy.expect_image()
+        if self.case.warms_caches {
+            self.policy.warm_caches()
         } else {
             self.policy.wake()
         }

@@ -3,7 +3,7 @@
 use rcwm_models::bundle::Bundle;
 use serde::Serialize;
 
-use super::ladder::{SINGLE, YARDSTICK};
+use super::ablation::{BASELINE, SINGLE};
 use super::{Case, Conditions, ControlBench, Limit, Stalls};
 use crate::engine::EngineSettings;
 use crate::realtime::Granted;
@@ -86,9 +86,9 @@ impl BenchReport {
             })
             .collect();
         let find = |settings: EngineSettings| engines.iter().find(|bench| bench.case.settings == settings);
-        let (deployed, single, yardstick) = (find(EngineSettings::tract()), find(SINGLE), find(YARDSTICK));
+        let (deployed, single, baseline) = (find(EngineSettings::tract()), find(SINGLE), find(BASELINE));
         let tail = |bench: &CaseBench| bench.tick().map(|tick| tick.p999_us / tick.p50_us);
-        let ratio = |bench: Option<&CaseBench>| Some(bench?.tick()?.p50_us / yardstick?.tick()?.p50_us);
+        let ratio = |bench: Option<&CaseBench>| Some(bench?.tick()?.p50_us / baseline?.tick()?.p50_us);
         Self {
             preset: bundle.manifest.provenance.preset.clone(),
             ticks,
@@ -153,7 +153,7 @@ impl BenchReport {
         text
     }
 
-    /// The steps of a ladder.
+    /// The steps of an ablation.
     #[must_use]
     pub fn steps(&self) -> Vec<Step> {
         let step = |bench: &CaseBench| {

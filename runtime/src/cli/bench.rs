@@ -25,8 +25,8 @@ pub(super) struct BenchArguments {
     #[arg(long, value_name = "N", default_value_t = 2000, value_parser = clap::value_parser!(u64).range(1..=100_000_000))]
     ticks: u64,
     /// Measures tract from the exported parts to what is deployed, one optimisation at a time, in place of the engines
-    #[arg(long, conflicts_with = "engine")]
-    ladder: bool,
+    #[arg(long, alias = "ladder", conflicts_with = "engine")]
+    ablation: bool,
     /// Measures with SCHED_FIFO of this priority and locked memory, as `run --realtime` does
     #[arg(long, value_name = "PRIORITY", num_args = 0..=1, default_missing_value = "50",
         value_parser = clap::value_parser!(u8).range(1..=99))]
@@ -44,8 +44,8 @@ pub(super) fn run(arguments: &BenchArguments) -> anyhow::Result<()> {
     let bundle = super::open_bundle(&arguments.bundle)?;
     let (kinds, left_out) = arguments.engine.engines()?;
     let mut cases = crate::bench::engines(&kinds);
-    if arguments.ladder {
-        cases = crate::bench::ladder();
+    if arguments.ablation {
+        cases = crate::bench::ablation();
     }
     let stop = super::stop_flag()?;
     let ticks = arguments.ticks as usize;
@@ -64,7 +64,7 @@ pub(super) fn run(arguments: &BenchArguments) -> anyhow::Result<()> {
     let report = &measured.report;
     measured.write(&arguments.files)?;
     super::write_json(arguments.json.as_deref(), report)?;
-    rcwm_models::out!("{}", if arguments.ladder { report.steps_text() } else { report.text() });
+    rcwm_models::out!("{}", if arguments.ablation { report.steps_text() } else { report.text() });
     if let Some(reason) = left_out {
         rcwm_models::outln!("engine ort not measured: {reason}");
     }

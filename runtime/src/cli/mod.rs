@@ -291,7 +291,7 @@ mod tests {
             "run --bundle b --instance a --record-episodes 2",
             "run --bundle b --instance a --telemetry-every 2s",
             "run --bundle b --instance a --realtime-priority 20",
-            "bench --bundle b --ladder --engine ort",
+            "bench --bundle b --ablation --engine ort",
             "replay --log l --episodes e --engine tract",
         ] {
             let words = std::iter::once("program").chain(refused.split_whitespace());
@@ -300,7 +300,7 @@ mod tests {
         for taken in [
             "run --bundle b --instance a --sample --seed 3",
             "run --bundle b --instance a --record r --record-episodes 2",
-            "bench --bundle b --ladder",
+            "bench --bundle b --ablation",
             "replay --log l --bundle b --engine tract",
         ] {
             let words = std::iter::once("program").chain(taken.split_whitespace());

@@ -57,8 +57,8 @@ pub(super) struct TimeArguments {
     #[arg(long, value_name = "US", default_value_t = 50)]
     spin_us: u64,
     /// Does without computing the last tick once more before an observation is expected: spares processor time, and finds cold caches
-    #[arg(long)]
-    no_rehearsal: bool,
+    #[arg(long, alias = "no-rehearsal")]
+    no_warm_up: bool,
     /// Asks for SCHED_FIFO and locked memory, and says what was granted; `require` ends the run where something is refused
     #[arg(long, value_name = "try|require", num_args = 0..=1, require_equals = true, default_missing_value = "try")]
     realtime: Option<Realtime>,
@@ -98,7 +98,7 @@ impl SafetyArguments {
             silence_max: (self.silence_max > 0.0).then(|| Duration::from_secs_f64(self.silence_max)),
             pacing: PacingSettings {
                 spin,
-                gets_ready: !time.no_rehearsal,
+                gets_ready: !time.no_warm_up,
                 grace_periods: self.grace,
                 stale_periods: self.stale_after,
             },

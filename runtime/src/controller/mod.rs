@@ -317,7 +317,7 @@ impl Controller {
     /// Prepares the policy for an observation that will come soon.
     fn get_ready(&mut self) {
         let start_ns = self.link.now_ns();
-        self.policy.expect_image();
+        self.policy.warm_caches();
         let took = self.since(start_ns);
         self.pacing.got_ready(took);
         self.telemetry.record(Stage::Ready, took.as_nanos() as u64);

@@ -325,14 +325,14 @@ pub fn available(kind: EngineKind) -> Result<(), EngineError> {
 }
 
 /// Names of a part's tensors and how to say that something does not fit.
-struct Border {
+struct TensorContract {
     engine: EngineKind,
     part: PartName,
     inputs: Vec<TensorSpec>,
     outputs: Vec<TensorSpec>,
 }
 
-impl Border {
+impl TensorContract {
     fn check(&self, inputs: &[Input<'_>], outputs: &[Output<'_>]) -> Result<(), EngineError> {
         self.compare("inputs", inputs.iter().map(Input::describe), &self.inputs)?;
         self.compare("outputs", outputs.iter().map(Output::describe), &self.outputs)

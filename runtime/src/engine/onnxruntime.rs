@@ -11,7 +11,7 @@ use ort::session::{HasSelectedOutputs, OutputSelector, RunOptions, Session, Sess
 use ort::value::{DynTensor, TensorElementType};
 use rcwm_models::bundle::{DType, TensorSpec};
 
-use super::{Border, EngineError, EngineKind, Input, Output, Part, Source};
+use super::{EngineError, EngineKind, Input, Output, Part, Source, TensorContract};
 
 /// One environment a process is all there may be; it stays until the process ends.
 static ENVIRONMENT: Mutex<Option<Environment>> = Mutex::new(None);
@@ -42,7 +42,7 @@ pub(super) fn environment() -> Result<Environment, EngineError> {
 
 /// A part in ONNX Runtime, with inputs and outputs in memory that is kept between runs.
 pub(super) struct OrtPart {
-    border: Border,
+    contract: TensorContract,
     session: Session,
     inputs: Vec<SessionInputValue<'static>>,
     options: RunOptions<HasSelectedOutputs>,
@@ -52,10 +52,11 @@ impl OrtPart {
     pub(super) fn load(source: Source<'_>, threads: usize) -> Result<Self, EngineError> {
         let environment = environment()?;
         let Source { part, bytes, inputs, outputs } = source;
-        let border = Border { engine: EngineKind::Ort, part, inputs, outputs };
-        let session = open_session(&environment, bytes, threads).map_err(|error| border.load_error(error))?;
-        let (inputs, options) = kept_tensors(&border).map_err(|error| border.load_error(error))?;
-        Ok(Self { border, session, inputs, options })
+        let contract = TensorContract { engine: EngineKind::Ort, part, inputs, outputs };
+        let session =
+            open_session(&environment, bytes, threads).map_err(|error| contract.load_error(error))?;
+        let (inputs, options) = kept_tensors(&contract).map_err(|error| contract.load_error(error))?;
+        Ok(Self { contract, session, inputs, options })
     }
 
     fn try_run(&mut self, inputs: &[Input<'_>], outputs: &mut [Output<'_>]) -> ort::Result<()> {
@@ -75,8 +76,8 @@ impl OrtPart {
 
 impl Part for OrtPart {
     fn run(&mut self, inputs: &[Input<'_>], outputs: &mut [Output<'_>]) -> Result<(), EngineError> {
-        self.border.check(inputs, outputs)?;
-        self.try_run(inputs, outputs).map_err(|error| self.border.run_error(error))
+        self.contract.check(inputs, outputs)?;
+        self.try_run(inputs, outputs).map_err(|error| self.contract.run_error(error))
     }
 }
 
@@ -92,13 +93,14 @@ fn open_session(environment: &Environment, bytes: &[u8], threads: usize) -> ort:
 
 type Kept = (Vec<SessionInputValue<'static>>, RunOptions<HasSelectedOutputs>);
 
-fn kept_tensors(border: &Border) -> ort::Result<Kept> {
+fn kept_tensors(contract: &TensorContract) -> ort::Result<Kept> {
     let allocator = Allocator::default();
     let make =
         |spec: &TensorSpec| DynTensor::new(&allocator, element_type(spec.dtype), spec.shape.as_slice());
-    let inputs = border.inputs.iter().map(|spec| Ok(make(spec)?.into())).collect::<ort::Result<Vec<_>>>()?;
+    let inputs =
+        contract.inputs.iter().map(|spec| Ok(make(spec)?.into())).collect::<ort::Result<Vec<_>>>()?;
     let mut selector = OutputSelector::default();
-    for spec in &border.outputs {
+    for spec in &contract.outputs {
         selector = selector.preallocate(&spec.name, make(spec)?);
     }
     Ok((inputs, RunOptions::new()?.with_outputs(selector)))

@@ -4,14 +4,14 @@ use std::sync::Arc;
 
 use tract_onnx::prelude::*;
 
-use super::{Border, EngineError, EngineKind, Input, Output, Part, Source};
+use super::{EngineError, EngineKind, Input, Output, Part, Source, TensorContract};
 use rcwm_models::bundle::{DType, TensorSpec};
 
 type State = TypedSimpleState;
 
 /// A part in tract.
 pub(super) struct TractPart {
-    border: Border,
+    contract: TensorContract,
     state: State,
     /// Kept between runs: after a run nobody else holds them, and they are written in place.
     inputs: Vec<Arc<Tensor>>,
@@ -20,11 +20,11 @@ pub(super) struct TractPart {
 impl TractPart {
     pub(super) fn load(source: Source<'_>) -> Result<Self, EngineError> {
         let Source { part, bytes, inputs, outputs } = source;
-        let border = Border { engine: EngineKind::Tract, part, inputs, outputs };
-        let state = plan(bytes).map_err(|error| border.load_error(format!("{error:#}")))?;
-        let inputs = border.inputs.iter().map(zeros).collect::<TractResult<Vec<_>>>();
-        let inputs = inputs.map_err(|error| border.load_error(format!("{error:#}")))?;
-        Ok(Self { border, state, inputs })
+        let contract = TensorContract { engine: EngineKind::Tract, part, inputs, outputs };
+        let state = plan(bytes).map_err(|error| contract.load_error(format!("{error:#}")))?;
+        let inputs = contract.inputs.iter().map(zeros).collect::<TractResult<Vec<_>>>();
+        let inputs = inputs.map_err(|error| contract.load_error(format!("{error:#}")))?;
+        Ok(Self { contract, state, inputs })
     }
 
     fn try_run(&mut self, inputs: &[Input<'_>], outputs: &mut [Output<'_>]) -> TractResult<()> {
@@ -46,8 +46,8 @@ impl TractPart {
 
 impl Part for TractPart {
     fn run(&mut self, inputs: &[Input<'_>], outputs: &mut [Output<'_>]) -> Result<(), EngineError> {
-        self.border.check(inputs, outputs)?;
-        self.try_run(inputs, outputs).map_err(|error| self.border.run_error(format!("{error:#}")))
+        self.contract.check(inputs, outputs)?;
+        self.try_run(inputs, outputs).map_err(|error| self.contract.run_error(format!("{error:#}")))
     }
 }
 

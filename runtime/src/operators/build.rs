@@ -7,14 +7,14 @@ use tract_onnx::pb::NodeProto;
 use tract_onnx::tract_hir::internal::*;
 
 /// What an operator is made of: the node with its attributes, and its inputs that are constants.
-pub(super) struct Recipe<'a> {
+pub(super) struct OpContext<'a> {
     pub(super) node: &'a NodeProto,
     pub(super) shape: &'a [usize],
     pub(super) facts: Vec<TypedFact>,
     constants: Vec<Option<Arc<Tensor>>>,
 }
 
-impl Recipe<'_> {
+impl OpContext<'_> {
     /// The floats of a constant input, and its shape.
     pub(super) fn floats(&self, input: usize) -> TractResult<(&[f32], &[usize])> {
         let tensor = self.constant(input)?;
@@ -45,7 +45,7 @@ impl Recipe<'_> {
 }
 
 /// Makes the operator, and says which inputs it still reads.
-pub(super) type Make = fn(&Recipe<'_>) -> TractResult<(Box<dyn TypedOp>, Vec<usize>)>;
+pub(super) type Make = fn(&OpContext<'_>) -> TractResult<(Box<dyn TypedOp>, Vec<usize>)>;
 
 #[derive(Clone)]
 struct OwnNode {
@@ -62,7 +62,7 @@ impl std::fmt::Debug for OwnNode {
 }
 
 /// The builder of a node with one output, whose shape stands in the attribute `shape`.
-pub(super) fn own(
+pub(super) fn custom_op(
     node: &NodeProto,
     dtype: DatumType,
     make: Make,
@@ -93,8 +93,8 @@ impl Expansion for OwnNode {
         let facts =
             inputs.iter().map(|input| model.outlet_fact(*input).cloned()).collect::<TractResult<Vec<_>>>()?;
         let constants = facts.iter().map(|fact| fact.konst.clone()).collect();
-        let recipe = Recipe { node: &self.node, shape: &self.shape, facts, constants };
-        let (op, read) = (self.make)(&recipe)?;
+        let context = OpContext { node: &self.node, shape: &self.shape, facts, constants };
+        let (op, read) = (self.make)(&context)?;
         let read: Vec<OutletId> = read.into_iter().map(|input| inputs[input]).collect();
         model.wire_node(prefix, op, &read)
     }

@@ -5,10 +5,10 @@ use tract_onnx::pb::NodeProto;
 use tract_onnx::tract_hir::internal::*;
 
 use super::CONV;
-use super::build::{Context, own};
+use super::build::{Context, custom_op};
+use super::custom_op::{Compute, CustomOp};
 use super::memory::slice;
 use super::norm::norm_of;
-use super::own::{Compute, Own};
 use crate::kernels::conv::Conv;
 use crate::kernels::norm::Norm;
 
@@ -18,20 +18,21 @@ const SHARED_FLOPS_MIN: usize = 2_000_000;
 const ROWS: usize = 4;
 
 pub(super) fn build(_: &Context<'_>, node: &NodeProto) -> TractResult<(Box<dyn InferenceOp>, Vec<String>)> {
-    own(node, f32::datum_type(), |recipe| {
-        let (weight, shape) = recipe.floats(1)?;
+    custom_op(node, f32::datum_type(), |context| {
+        let (weight, shape) = context.floats(1)?;
         let [channels_out, channels_in, 4, 4] = *shape else { bail!("a weight of shape {shape:?}") };
-        let side = 2 * recipe.shape[1];
-        if recipe.input_len(0)? != side * side * channels_in || !Conv::fits(channels_in, channels_out, side) {
+        let side = 2 * context.shape[1];
+        if context.input_len(0)? != side * side * channels_in || !Conv::fits(channels_in, channels_out, side)
+        {
             bail!("a convolution of {channels_in} to {channels_out} channels of {side} x {side} pixels");
         }
-        let from_bytes = match recipe.node.get_attr_opt::<f32>("divisor")? {
-            Some(divisor) => Some((divisor, recipe.node.get_attr::<f32>("shift")?)),
+        let from_bytes = match context.node.get_attr_opt::<f32>("divisor")? {
+            Some(divisor) => Some((divisor, context.node.get_attr::<f32>("shift")?)),
             None => None,
         };
         let conv = Conv::new(weight, channels_in, channels_out, side);
-        let block = Block { conv, norm: norm_of(recipe, 2)?, from_bytes, shape: recipe.shape.into() };
-        Ok((Own::boxed(block), vec![0]))
+        let block = Block { conv, norm: norm_of(context, 2)?, from_bytes, shape: context.shape.into() };
+        Ok((CustomOp::boxed(block), vec![0]))
     })
 }
 

@@ -4,9 +4,9 @@ use pulp::Arch;
 use tract_onnx::pb::NodeProto;
 use tract_onnx::tract_hir::internal::*;
 
-use super::build::{Context, own};
+use super::build::{Context, custom_op};
+use super::custom_op::{Compute, CustomOp};
 use super::memory::slice;
-use super::own::{Compute, Own};
 use super::{DRAW, LOG_PROBS};
 use crate::kernels::latents;
 
@@ -14,15 +14,15 @@ pub(super) fn build_log_probs(
     _: &Context<'_>,
     node: &NodeProto,
 ) -> TractResult<(Box<dyn InferenceOp>, Vec<String>)> {
-    own(node, f32::datum_type(), |recipe| {
-        let (factor, offset) = (recipe.node.get_attr("factor")?, recipe.node.get_attr("offset")?);
-        let shape: TVec<usize> = recipe.shape.into();
+    custom_op(node, f32::datum_type(), |context| {
+        let (factor, offset) = (context.node.get_attr("factor")?, context.node.get_attr("offset")?);
+        let shape: TVec<usize> = context.shape.into();
         let classes = shape.last().copied().filter(|classes| *classes > 0);
         let classes = classes.ok_or_else(|| format_err!("log-probabilities of shape {shape:?}"))?;
-        if recipe.input_len(0)? != shape.iter().product::<usize>() {
+        if context.input_len(0)? != shape.iter().product::<usize>() {
             bail!("log-probabilities of shape {shape:?} of other logits");
         }
-        Ok((Own::boxed(LogProbs { factor, offset, classes, shape }), vec![0]))
+        Ok((CustomOp::boxed(LogProbs { factor, offset, classes, shape }), vec![0]))
     })
 }
 
@@ -30,14 +30,14 @@ pub(super) fn build_draw(
     _: &Context<'_>,
     node: &NodeProto,
 ) -> TractResult<(Box<dyn InferenceOp>, Vec<String>)> {
-    own(node, i64::datum_type(), |recipe| {
-        let classes: usize = recipe.node.get_attr("classes")?;
-        let shape: TVec<usize> = recipe.shape.into();
+    custom_op(node, i64::datum_type(), |context| {
+        let classes: usize = context.node.get_attr("classes")?;
+        let shape: TVec<usize> = context.shape.into();
         let len = shape.iter().product::<usize>() * classes;
-        if recipe.input_len(0)? != len || recipe.input_len(1)? != len {
+        if context.input_len(0)? != len || context.input_len(1)? != len {
             bail!("classes of shape {shape:?}, {classes} each, of other log-probabilities or noise");
         }
-        Ok((Own::boxed(Draw { classes, shape }), vec![0, 1]))
+        Ok((CustomOp::boxed(Draw { classes, shape }), vec![0, 1]))
     })
 }
 

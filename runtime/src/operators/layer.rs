@@ -4,10 +4,10 @@ use pulp::Arch;
 use tract_onnx::pb::NodeProto;
 use tract_onnx::tract_hir::internal::*;
 
-use super::build::{Context, Recipe, own};
+use super::build::{Context, OpContext, custom_op};
+use super::custom_op::{Compute, CustomOp};
 use super::memory::slice;
 use super::norm::norm_of;
-use super::own::{Compute, Own};
 use super::{LAYER, Term};
 use crate::kernels::matrix::Matrix;
 use crate::kernels::norm::Norm;
@@ -20,9 +20,9 @@ const SHARED_WEIGHTS_MIN: usize = 1 << 16;
 const COLUMNS: usize = 128;
 
 pub(super) fn build(_: &Context<'_>, node: &NodeProto) -> TractResult<(Box<dyn InferenceOp>, Vec<String>)> {
-    own(node, f32::datum_type(), |recipe| {
-        let (layer, read) = Layer::of(recipe)?;
-        Ok((Own::boxed(layer), read))
+    custom_op(node, f32::datum_type(), |context| {
+        let (layer, read) = Layer::of(context)?;
+        Ok((CustomOp::boxed(layer), read))
     })
 }
 
@@ -47,32 +47,32 @@ pub(super) struct Layer {
 }
 
 impl Layer {
-    fn of(recipe: &Recipe<'_>) -> TractResult<(Self, Vec<usize>)> {
-        let width = *recipe.shape.last().ok_or_else(|| format_err!("a layer without a shape"))?;
-        if recipe.shape.iter().product::<usize>() != width {
-            bail!("a layer of shape {:?}, expected one row", recipe.shape);
+    fn of(context: &OpContext<'_>) -> TractResult<(Self, Vec<usize>)> {
+        let width = *context.shape.last().ok_or_else(|| format_err!("a layer without a shape"))?;
+        if context.shape.iter().product::<usize>() != width {
+            bail!("a layer of shape {:?}, expected one row", context.shape);
         }
-        let precision = match recipe.node.get_attr_opt::<i64>("half")? {
+        let precision = match context.node.get_attr_opt::<i64>("half")? {
             Some(1) => Precision::F16,
             _ => Precision::F32,
         };
         let (mut parts, mut read, mut input) = (Vec::new(), Vec::new(), 0);
-        let letters = recipe.node.get_attr::<String>("terms")?;
+        let letters = context.node.get_attr::<String>("terms")?;
         for letter in letters.bytes() {
             let term =
                 Term::of_letter(letter).ok_or_else(|| format_err!("a layer with terms {letters:?}"))?;
-            let (part, inputs) = Part::of(recipe, term, input, width, precision)?;
+            let (part, inputs) = Part::of(context, term, input, width, precision)?;
             if !matches!(part, Part::Bias(_)) {
                 read.push(input);
             }
             parts.push(part);
             input += inputs;
         }
-        let norm = match recipe.node.get_attr_opt::<f32>("epsilon")? {
-            Some(_) => Some(norm_of(recipe, input)?),
+        let norm = match context.node.get_attr_opt::<f32>("epsilon")? {
+            Some(_) => Some(norm_of(context, input)?),
             None => None,
         };
-        Ok((Self { parts, norm, shape: recipe.shape.into() }, read))
+        Ok((Self { parts, norm, shape: context.shape.into() }, read))
     }
 
     /// Number of weights.
@@ -118,7 +118,7 @@ fn add(out: &mut [f32], values: &[f32]) {
 impl Part {
     /// The part that begins at an input, and how many inputs of the node it takes.
     fn of(
-        recipe: &Recipe<'_>,
+        context: &OpContext<'_>,
         term: Term,
         input: usize,
         width: usize,
@@ -128,28 +128,30 @@ impl Part {
             |shape: &[usize]| Err(format_err!("a weight of shape {shape:?} in a layer {width} wide"));
         match term {
             Term::Product => {
-                let (values, shape) = recipe.floats(input + 1)?;
+                let (values, shape) = context.floats(input + 1)?;
                 match *shape {
-                    [rows, columns] if columns == width && rows == recipe.input_len(input)? => {
+                    [rows, columns] if columns == width && rows == context.input_len(input)? => {
                         Ok((Self::Product(Matrix::new(values, rows, columns, precision)), 2))
                     }
                     _ => refuse(shape),
                 }
             }
             Term::Rows => {
-                let offsets = recipe.integers(input + 1)?.to_vec();
-                let (values, shape) = recipe.floats(input + 2)?;
+                let offsets = context.integers(input + 1)?.to_vec();
+                let (values, shape) = context.floats(input + 2)?;
                 match *shape {
-                    [rows, columns] if columns == width && offsets.len() == recipe.input_len(input)? => {
+                    [rows, columns] if columns == width && offsets.len() == context.input_len(input)? => {
                         Ok((Self::Rows { offsets, table: Table::new(values, rows, columns, precision) }, 3))
                     }
                     _ => refuse(shape),
                 }
             }
-            Term::Value if recipe.input_len(input)? != width => {
+            Term::Value if context.input_len(input)? != width => {
                 bail!("a layer {width} wide with another value")
             }
-            Term::Value if recipe.is_constant(input) => Ok((Self::Bias(recipe.floats(input)?.0.to_vec()), 1)),
+            Term::Value if context.is_constant(input) => {
+                Ok((Self::Bias(context.floats(input)?.0.to_vec()), 1))
+            }
             Term::Value => Ok((Self::Value, 1)),
         }
     }

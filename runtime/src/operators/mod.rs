@@ -5,11 +5,11 @@
 
 mod build;
 mod convolution;
+mod custom_op;
 mod latents;
 mod layer;
 mod memory;
 mod norm;
-mod own;
 mod shared;
 
 use std::sync::Arc;
@@ -17,7 +17,7 @@ use std::sync::Arc;
 use tract_onnx::prelude::TypedModel;
 
 use crate::team::Team;
-use own::Own;
+use custom_op::CustomOp;
 
 /// Domain of the operators.
 pub const DOMAIN: &str = "rcwm";
@@ -82,9 +82,9 @@ pub fn onnx() -> tract_onnx::Onnx {
 }
 
 /// Tells our operators of a model with whom to share large work.
-pub fn settle(model: &mut TypedModel, team: Option<&SharedTeam>) {
+pub fn bind_threads(model: &mut TypedModel, team: Option<&SharedTeam>) {
     for node in &mut model.nodes {
-        Own::<convolution::Block>::settle(node, team);
-        Own::<layer::Layer>::settle(node, team);
+        CustomOp::<convolution::Block>::bind_threads(node, team);
+        CustomOp::<layer::Layer>::bind_threads(node, team);
     }
 }

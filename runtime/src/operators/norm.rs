@@ -5,25 +5,25 @@ use tract_onnx::pb::NodeProto;
 use tract_onnx::tract_hir::internal::*;
 
 use super::NORM;
-use super::build::{Context, Recipe, own};
+use super::build::{Context, OpContext, custom_op};
+use super::custom_op::{Compute, CustomOp};
 use super::memory::slice;
-use super::own::{Compute, Own};
 use crate::kernels::norm::Norm;
 
 pub(super) fn build(_: &Context<'_>, node: &NodeProto) -> TractResult<(Box<dyn InferenceOp>, Vec<String>)> {
-    own(node, f32::datum_type(), |recipe| {
-        Ok((Own::boxed(NormRows { norm: norm_of(recipe, 1)?, shape: recipe.shape.into() }), vec![0]))
+    custom_op(node, f32::datum_type(), |context| {
+        Ok((CustomOp::boxed(NormRows { norm: norm_of(context, 1)?, shape: context.shape.into() }), vec![0]))
     })
 }
 
 /// The norm whose parameters are the inputs `first` and the one after it.
-pub(super) fn norm_of(recipe: &Recipe<'_>, first: usize) -> TractResult<Norm> {
-    let (gain, shift) = (recipe.floats(first)?.0.to_vec(), recipe.floats(first + 1)?.0.to_vec());
-    if gain.is_empty() || gain.len() != shift.len() || recipe.shape.last() != Some(&gain.len()) {
-        bail!("a norm of {} gains and {} shifts over {:?}", gain.len(), shift.len(), recipe.shape);
+pub(super) fn norm_of(context: &OpContext<'_>, first: usize) -> TractResult<Norm> {
+    let (gain, shift) = (context.floats(first)?.0.to_vec(), context.floats(first + 1)?.0.to_vec());
+    if gain.is_empty() || gain.len() != shift.len() || context.shape.last() != Some(&gain.len()) {
+        bail!("a norm of {} gains and {} shifts over {:?}", gain.len(), shift.len(), context.shape);
     }
-    let silu = recipe.node.get_attr::<i64>("silu")? != 0;
-    Ok(Norm { gain, shift, eps: recipe.node.get_attr("epsilon")?, silu })
+    let silu = context.node.get_attr::<i64>("silu")? != 0;
+    Ok(Norm { gain, shift, eps: context.node.get_attr("epsilon")?, silu })
 }
 
 #[derive(Debug)]

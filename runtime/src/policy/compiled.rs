@@ -183,10 +183,10 @@ impl Tick for Compiled {
         self.act(work)
     }
 
-    fn rehearse(&mut self) {
+    fn warm_caches(&mut self) {
         // The last image in place of the next. What comes out, an error included, is overwritten by whatever comes next.
         let _ = self.encoder.run(&mut self.values);
-        let _ = self.branches.rehearse(&mut self.values, &mut StageClock::start());
+        let _ = self.branches.warm_caches(&mut self.values, &mut StageClock::start());
         let _ = self.actor.run(&mut self.values);
         if let Some(team) = &self.team {
             team.take_late();

@@ -164,7 +164,7 @@ impl Policy {
                 Ok(_) | Err(PolicyError::NotFinite { .. }) => {}
                 Err(error) => return Err(error),
             }
-            self.expect_image();
+            self.warm_caches();
         }
         self.noise = NoiseSource::new(sampling, &self.manifest.model);
         self.ahead = None;
@@ -240,9 +240,9 @@ impl Policy {
 
     /// Gets ready for an image that will come soon: since the last one others have used the caches, so what stands between image and
     /// action is computed once more from the last image, and dropped. Takes as long as a tick; results do not depend on it.
-    pub fn expect_image(&mut self) {
+    pub fn warm_caches(&mut self) {
         self.tick.wake();
-        self.tick.rehearse();
+        self.tick.warm_caches();
     }
 
     /// Says that an image may come at any moment: a second thread, where there is one, looks for work from now on, for a short while.

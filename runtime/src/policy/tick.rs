@@ -34,7 +34,7 @@ pub(super) trait Tick: Send {
 
     /// An image will come soon: what [`Self::observe`] does is done once with what is there, for the sake of the caches. Changes nothing that
     /// is read later.
-    fn rehearse(&mut self) {}
+    fn warm_caches(&mut self) {}
 }
 
 pub(super) fn load(bundle: &Bundle, settings: EngineSettings) -> Result<Box<dyn Tick>, PolicyError> {

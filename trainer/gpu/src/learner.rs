@@ -57,7 +57,7 @@ pub struct Batch<'a> {
     pub first: &'a [bool],
     /// Whether masks are used.
     pub masks: bool,
-    /// Which batch of a run it is: what is painted takes turns by it.
+    /// Which batch of a run it is: what is decoded takes turns by it.
     pub number: u64,
     /// By how many pixels each sequence's images move, right and down; empty: none moves.
     pub shift: &'a [[i32; 2]],
@@ -413,8 +413,8 @@ impl Learner {
         let reward: Vec<f32> = (0..rows).map(|row| batch.reward[from(row)]).collect();
         let terminal: Vec<f32> =
             (0..rows).map(|row| f32::from(u8::from(batch.terminal[from(row)]))).collect();
-        let every = sizes.paint_every as u64;
-        let painted: Vec<u32> = (0..rows as u32)
+        let every = sizes.decode_every as u64;
+        let decoded: Vec<u32> = (0..rows as u32)
             .filter(|row| (u64::from(*row) / b as u64 + batch.number).is_multiple_of(every))
             .collect();
         let mut control = [0u32; 10];
@@ -457,7 +457,7 @@ impl Learner {
         machine.upload(inputs.reward, &reward)?;
         machine.upload(inputs.terminal, &terminal)?;
         machine.upload(inputs.first, &flags)?;
-        machine.upload(inputs.painted, &painted)?;
+        machine.upload(inputs.decoded, &decoded)?;
         machine.upload(inputs.noise, &control)
     }
 

@@ -20,8 +20,8 @@ pub struct Sizes {
     pub batch: usize,
     /// T, steps of a sequence.
     pub length: usize,
-    /// Of so many steps one is painted.
-    pub paint_every: usize,
+    /// Of so many steps one is decoded.
+    pub decode_every: usize,
     /// Whether draws are the most probable class and actions the mean, without noise: for comparisons.
     pub mode: bool,
 }
@@ -33,10 +33,10 @@ impl Sizes {
         self.batch * self.length
     }
 
-    /// Rows that are painted.
+    /// Rows that are decoded.
     #[must_use]
-    pub fn painted(&self) -> usize {
-        self.batch * self.length / self.paint_every
+    pub fn decoded(&self) -> usize {
+        self.batch * self.length / self.decode_every
     }
 
     /// Branches of the model.
@@ -125,8 +125,8 @@ pub struct Inputs {
     pub terminal: u64,
     /// u32 [T B].
     pub first: u64,
-    /// Rows that are painted, u32.
-    pub painted: u64,
+    /// Rows that are decoded, u32.
+    pub decoded: u64,
     /// Key and stream of the noise, u32 [10].
     pub noise: u64,
     /// Where each branch's KL goes, [2, T B].
@@ -165,7 +165,7 @@ pub fn losses(
     tape.program.part("scan");
     let pairs = scan(tape, source, sizes, inputs, &embeds, features);
     tape.program.part("decode");
-    painted(tape, source, sizes, inputs, (images, masks, features), scales, scalars);
+    decoded(tape, source, sizes, inputs, (images, masks, features), scales, scalars);
     tape.program.part("heads");
     other_losses(tape, source, sizes, inputs, &pairs, scales, (features, scalars));
     tape.run_backward();
@@ -312,7 +312,7 @@ fn scan(
     posteriors.iter().map(|head| head.logits).zip(priors).collect()
 }
 
-fn painted(
+fn decoded(
     tape: &mut Tape,
     source: Source<'_>,
     sizes: &Sizes,
@@ -321,9 +321,9 @@ fn painted(
     scales: WorldScales,
     scalars: Matrix,
 ) {
-    let count = sizes.painted();
-    let index = Matrix::fixed(inputs.painted, 1, count);
-    let every = sizes.paint_every;
+    let count = sizes.decoded();
+    let index = Matrix::fixed(inputs.decoded, 1, count);
+    let every = sizes.decode_every;
     let chosen = if every == 1 {
         features
     } else {

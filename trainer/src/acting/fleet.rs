@@ -4,7 +4,7 @@ use rcwm_models::ACTION_LEN;
 use rcwm_models::episode::{Episode, EpisodeBuilder, EpisodeError};
 use rcwm_models::wire::{ObservationFlags, ObservationSample};
 
-use super::policy::Seen;
+use super::policy::PolicyInput;
 use crate::simulators::{Client, ClientError, Launch, SimulatorProcess};
 
 /// Why acting in simulators failed.
@@ -46,8 +46,8 @@ impl Gathered {
 
     /// What a policy decides by.
     #[must_use]
-    pub fn seen(&self) -> Seen<'_> {
-        Seen {
+    pub fn seen(&self) -> PolicyInput<'_> {
+        PolicyInput {
             simulator: self.simulator,
             first: self.is_first(),
             image: &self.observation.image,

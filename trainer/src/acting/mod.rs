@@ -12,4 +12,4 @@ mod policy;
 
 pub use filter::filter_step;
 pub use fleet::{Fleet, FleetError, Gathered, Recorded};
-pub use policy::{Decision, Policy, Seen};
+pub use policy::{Decision, Policy, PolicyInput};

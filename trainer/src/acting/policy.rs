@@ -7,7 +7,7 @@ use crate::model::latent::{Latent, Sampler, State};
 
 /// What one simulator shows.
 #[derive(Debug, Clone, Copy)]
-pub struct Seen<'a> {
+pub struct PolicyInput<'a> {
     /// Which one: its place among all of them.
     pub simulator: usize,
     /// Whether an episode begins.
@@ -47,7 +47,7 @@ impl Policy {
     ///
     /// # Errors
     /// Those of candle.
-    pub fn decide(&mut self, seen: &[Seen<'_>], sampler: &mut Sampler) -> Result<Vec<Decision>> {
+    pub fn decide(&mut self, seen: &[PolicyInput<'_>], sampler: &mut Sampler) -> Result<Vec<Decision>> {
         if seen.is_empty() {
             return Ok(Vec::new());
         }

@@ -6,7 +6,8 @@ use anyhow::{Context, Result, bail, ensure};
 use indicatif::{ProgressBar, ProgressStyle};
 use rcwm_models::tasks::{DOWNSTREAM, UPSTREAM, task_id};
 use rcwm_trainer::simulators::{
-    Amounts, CollectSettings, Collected, DISTURBANCES, Plan, Seen, Sums, collect, collect_disturbed, record,
+    Amounts, CollectSettings, Collected, DISTURBANCES, Plan, Progress, Sums, collect, collect_disturbed,
+    record,
 };
 use serde::Serialize;
 
@@ -101,7 +102,8 @@ impl Collect {
 
     fn join(&self, instance: &str, stop: &std::sync::atomic::AtomicBool) -> Result<Sums> {
         let bar = bar(self.episodes, self.steps_max)?;
-        let sums = record(instance, self.episodes, &self.out, self.seed, stop, &|seen| advance(&bar, seen))?;
+        let sums =
+            record(instance, self.episodes, &self.out, self.seed, stop, &|progress| advance(&bar, progress))?;
         bar.finish_and_clear();
         Ok(sums)
     }
@@ -129,7 +131,7 @@ impl Collect {
         };
         let plan = Plan::new(&self.out, &tasks, &amounts, self.seed, EPISODES_A_RUN);
         let bar = bar(plan.episodes(), self.steps_max)?;
-        let sums = collect(&plan, &settings, stop, &|seen| advance(&bar, seen))
+        let sums = collect(&plan, &settings, stop, &|progress| advance(&bar, progress))
             .context("collecting stopped; whole episodes are kept and the same command goes on")?;
         bar.finish_and_clear();
         if let Some(look) = self.beside.as_ref().filter(|_| !stop.load(std::sync::atomic::Ordering::Relaxed))
@@ -137,7 +139,7 @@ impl Collect {
             let plan = Plan::of_disturbed(&self.out, &tasks, &amounts, self.seed, EPISODES_A_RUN)?;
             let settings = CollectSettings { disturb: look.clone(), ..settings };
             let bar = self::bar(plan.episodes(), self.steps_max)?;
-            collect_disturbed(&plan, &settings, stop, &|seen| advance(&bar, seen))
+            collect_disturbed(&plan, &settings, stop, &|progress| advance(&bar, progress))
                 .context("collecting stopped; whole episodes are kept and the same command goes on")?;
             bar.finish_and_clear();
         }
@@ -172,10 +174,10 @@ pub(super) fn bar(episodes: u64, steps_max: u32) -> Result<Bar> {
     Ok(Bar::new(bar, "recording", "steps"))
 }
 
-pub(super) fn advance(bar: &ProgressBar, seen: Seen) {
-    match seen {
-        Seen::Step => bar.inc(1),
-        Seen::Episode => {
+pub(super) fn advance(bar: &ProgressBar, progress: Progress) {
+    match progress {
+        Progress::Step => bar.inc(1),
+        Progress::Episode => {
             let episodes = bar.message().parse::<u64>().unwrap_or(0) + 1;
             bar.set_message(episodes.to_string());
         }

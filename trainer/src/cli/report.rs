@@ -13,8 +13,8 @@ use rcwm_trainer::evaluation::{
 };
 use rcwm_trainer::replay::Folder;
 use rcwm_trainer::report::{
-    AttentionPart, Dynamics, Learning, Made, Policy, Report, ReportError, Results, Store, Subject, Success,
-    UNDISTURBED, policies, shown_path,
+    AttentionPart, Dynamics, Learning, Policy, Provenance, Report, ReportError, Results, Store, Subject,
+    Success, UNDISTURBED, policies, shown_path,
 };
 
 use super::bars::{self, Bar};
@@ -81,7 +81,7 @@ impl Inputs<'_> {
         {
             return outcome;
         }
-        let report = Report::read(&store, Made::now(self.device_name), command())?;
+        let report = Report::read(&store, Provenance::now(self.device_name), command())?;
         report.write(folder)?;
         if let Some(json) = self.json {
             super::write_json(json, &report)?;
@@ -124,8 +124,8 @@ impl Work<'_> {
         self.policies()
     }
 
-    fn made(&self) -> Made {
-        Made::now(self.inputs.device_name)
+    fn made(&self) -> Provenance {
+        Provenance::now(self.inputs.device_name)
     }
 
     fn results(&mut self) -> Result<()> {

@@ -226,7 +226,7 @@ fn run(
     let programs = Programs::find(settings)?;
     let folder = tempfile::tempdir().map_err(ClosedLoopError::Folder)?;
     let domain = Domain::new();
-    let place = Place { bundle, folder: folder.path(), record };
+    let place = StepContext { bundle, folder: folder.path(), record };
     let start = |(number, share): (usize, &Range<u64>)| {
         Pair::start(&programs, &place, settings, &domain, number, share)
     };
@@ -311,7 +311,7 @@ impl Programs {
 }
 
 /// Folders that the programs are told.
-struct Place<'a> {
+struct StepContext<'a> {
     bundle: &'a Path,
     /// For summaries.
     folder: &'a Path,
@@ -360,7 +360,7 @@ struct Pair {
 impl Pair {
     fn start(
         programs: &Programs,
-        place: &Place<'_>,
+        place: &StepContext<'_>,
         settings: &ClosedLoopSettings,
         domain: &Domain,
         number: usize,

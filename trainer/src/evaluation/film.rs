@@ -32,7 +32,7 @@ pub struct Film {
 }
 
 impl Film {
-    /// The film of one row of a batch: `truth` u8 [B, T, 64, 64, 3] and what was painted of the same steps.
+    /// The film of one row of a batch: `truth` u8 [B, T, 64, 64, 3] and what was decoded of the same steps.
     ///
     /// # Errors
     /// Those of candle.
@@ -48,7 +48,7 @@ impl Film {
             let error: Vec<f32> = truth.iter().zip(&imagined).map(|(a, b)| (a - b).abs()).collect();
             let mut panels = vec![colours(&truth), colours(&imagined), colours(&error)];
             for (picture, mask) in &branches {
-                // Where the mask is 0 nothing is painted: that is the middle grey, which the value 0 stands for.
+                // Where the mask is 0 nothing is decoded: that is the middle grey, which the value 0 stands for.
                 panels.push(colours(&lifted(values(picture, t)?)));
                 let mask: Vec<f32> = values(mask, t)?.into_iter().flat_map(|x| [x; 3]).collect();
                 panels.push(colours(&mask));

@@ -147,7 +147,7 @@ impl Trace {
     }
 }
 
-/// Measures states of the steps from `from` on, [B, L, ...], and what was painted of them, against the truth of a batch with masks:
+/// Measures states of the steps from `from` on, [B, L, ...], and what was decoded of them, against the truth of a batch with masks:
 /// a trace a row.
 ///
 /// # Errors

@@ -13,7 +13,7 @@ use super::{
 use crate::model::agent::Agent;
 use crate::model::latent::{Sampler, State};
 
-/// Trajectories at a time: bounds the memory of the painted pictures.
+/// Trajectories at a time: bounds the memory of the decoded pictures.
 const ROWS: usize = 10;
 
 /// How latents are chosen from their distributions.

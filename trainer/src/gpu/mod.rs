@@ -82,7 +82,7 @@ impl GpuLearner {
             model: (*model).clone(),
             batch: plan.batch.0,
             length: plan.batch.1,
-            paint_every: world.paint_every,
+            decode_every: world.decode_every,
             mode: plan.mode,
         };
         let scales = WorldScales {

@@ -24,7 +24,7 @@ pub struct Batch {
     pub robot_mask: Option<Tensor>,
     /// By row, then step: true where the action was a push off course and is no example.
     pub pushed: Vec<bool>,
-    /// Which batch of a run it is: where only some steps are painted, these take turns by it.
+    /// Which batch of a run it is: where only some steps are decoded, these take turns by it.
     pub number: u64,
 }
 

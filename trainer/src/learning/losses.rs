@@ -66,12 +66,13 @@ pub fn world_losses(
 ) -> Result<WorldLosses> {
     let embeds = part("encode", || agent.world.encode(batch.seen.as_ref().unwrap_or(&batch.image)))?;
     let observed = part("observe", || agent.world.observe(&embeds, &batch.action, &batch.first, sampler))?;
-    let painted = part("decode", || painted(agent, batch, settings.paint_every, &observed.posteriors))?;
-    part("other losses", || other_losses(agent, batch, settings, observed, painted))
+    let reconstruction =
+        part("decode", || reconstruction(agent, batch, settings.decode_every, &observed.posteriors))?;
+    part("other losses", || other_losses(agent, batch, settings, observed, reconstruction))
 }
 
 /// Squared errors of the pictures and the robot's masks at every `every`-th step, which one first depends on the batch's number.
-fn painted(
+fn reconstruction(
     agent: &Agent,
     batch: &Batch,
     every: usize,
@@ -96,10 +97,10 @@ fn other_losses(
     batch: &Batch,
     settings: &WorldSettings,
     observed: Observed,
-    painted: (Tensor, Option<Tensor>),
+    reconstruction: (Tensor, Option<Tensor>),
 ) -> Result<WorldLosses> {
-    let image = painted.0.mean_all()?;
-    let robot_mask = painted.1.map(|loss| loss.mean_all()).transpose()?;
+    let image = reconstruction.0.mean_all()?;
+    let robot_mask = reconstruction.1.map(|loss| loss.mean_all()).transpose()?;
     let features = observed.posteriors.features()?; // [B, T, state width]
     let reward = agent.heads.reward.loss(&features, &batch.reward)?.mean_all()?;
     let continues = continue_loss(&agent.heads.continue_logit(&features)?, &batch.terminal)?;

@@ -18,8 +18,9 @@ pub struct WorldSettings {
     pub dynamics_scale: f64,
     /// Factor of KL[q || sg(p)], which trains the posterior.
     pub representation_scale: f64,
-    /// Of so many steps one is painted and compared with its image, by turns: painting is most of an update's work. 1 paints all.
-    pub paint_every: usize,
+    /// Of so many steps one is decoded and compared with its image, by turns: decoding is most of an update's work. 1 decodes all.
+    #[serde(alias = "paint_every")]
+    pub decode_every: usize,
     /// KL below which nothing is learned from it, in nats per branch and step.
     pub free_nats: f64,
     /// The optimiser.
@@ -37,7 +38,7 @@ impl Default for WorldSettings {
             continue_scale: 1.0,
             dynamics_scale: 0.5,
             representation_scale: 0.1,
-            paint_every: 1,
+            decode_every: 1,
             free_nats: 1.0,
             adam: AdamSettings {
                 learning_rate: 1e-4,

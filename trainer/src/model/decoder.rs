@@ -8,7 +8,7 @@ use super::layers::{Linear, NORM_EPS, Norm};
 use super::parameters::{Built, Scope};
 use crate::ops::{self, ConvLayer};
 
-/// What one decoder paints.
+/// What one decoder reconstructs.
 #[derive(Debug, Clone)]
 pub struct Picture {
     /// [..., 64, 64, 3], in the range of `x/255 - 0.5`.

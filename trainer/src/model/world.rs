@@ -190,7 +190,7 @@ impl World {
         let stacks: Vec<_> = maps.iter().map(|(map, layers)| (map, layers.as_slice())).collect();
         let images = images.reshape(((), 64, 64, 3))?;
         let masks = masks.map(|masks| masks.reshape(((), 64, 64))).transpose()?;
-        ops::painted_loss(&stacks, &images, masks.as_ref())
+        ops::reconstruction_loss(&stacks, &images, masks.as_ref())
     }
 
     /// The pictures of a state [..., ...].

@@ -28,8 +28,8 @@ mod memory;
 mod node;
 mod noise;
 mod norm;
-mod painted;
 mod picture;
+mod reconstruction;
 mod rows;
 mod two_hot;
 
@@ -53,6 +53,6 @@ pub use linear::linear;
 pub use memory::{keep_freed_memory, return_freed_memory};
 pub use noise::{gumbel, normal};
 pub use norm::{layer_norm, layer_norm_silu};
-pub use painted::painted_loss;
 pub use picture::{image_to_float, picture_loss};
+pub use reconstruction::reconstruction_loss;
 pub use two_hot::{TWO_HOT_LIMIT, bins, bins_tensor, symexp, symlog, two_hot_loss, two_hot_mean};

@@ -1,12 +1,12 @@
 //! Fused operations in candle's graph: any number of inputs and outputs, with a hand-written backward pass.
 //!
 //! candle's custom ops take up to three inputs and give one output. A fused op computes its results at once, before it enters the graph. There
-//! it is a node whose inputs beyond three hang on a chain of links, and whose outputs beyond one hang on it as taps. Links
-//! and taps carry a token of one number; gradients pass them by through [`Slots`].
+//! it is a node whose inputs beyond three hang on a chain of input shims, and whose outputs beyond one hang on it as output shims. Shims
+//! carry a token of one number; gradients pass them by through [`ShimGradients`].
 //!
 //! ```text
-//! x1, x2, x3 -> link -> link -> node -> tap (output 1)
-//!         x4, x5 ----------^        \-> tap (output 2)
+//! x1, x2, x3 -> input shim -> input shim -> node -> output shim 1
+//!         x4, x5 ----------------^              \-> output shim 2
 //! ```
 
 use std::ops::Deref;
@@ -120,18 +120,18 @@ pub fn record(
             .map(|(values, shape)| Tensor::from_vec(values, shape, &Device::Cpu))
             .collect();
     }
-    let slots = Arc::new(Mutex::new(Slots::default()));
-    let link = |first: usize, count: usize| Link { slots: slots.clone(), first, count };
+    let gradients = Arc::new(Mutex::new(ShimGradients::default()));
+    let input_shim = |first: usize, count: usize| InputShim { gradients: gradients.clone(), first, count };
     let token = match *tracked.as_slice() {
-        [x] => x.apply_op1(link(0, 1))?,
-        [x, y] => x.apply_op2(y, link(0, 2))?,
+        [x] => x.apply_op1(input_shim(0, 1))?,
+        [x, y] => x.apply_op2(y, input_shim(0, 2))?,
         [x, y, z, ref rest @ ..] => {
-            let mut token = x.apply_op3(y, z, link(0, 3))?;
+            let mut token = x.apply_op3(y, z, input_shim(0, 3))?;
             for (index, pair) in rest.chunks(2).enumerate() {
                 let first = 3 + 2 * index;
                 token = match *pair {
-                    [x, y] => token.apply_op3(x, y, Chained(link(first, 2)))?,
-                    [x] => token.apply_op2(x, Chained(link(first, 1)))?,
+                    [x, y] => token.apply_op3(x, y, Chained(input_shim(first, 2)))?,
+                    [x] => token.apply_op2(x, Chained(input_shim(first, 1)))?,
                     _ => unreachable!("chunks of at most two"),
                 };
             }
@@ -140,11 +140,16 @@ pub fn record(
         [] => unreachable!("checked above"),
     };
     let count = outputs.len();
-    let node = token.apply_op1(Node { slots: slots.clone(), wanted, outputs: count, op: Box::new(op) })?;
-    let tap = |(index, (values, shape))| {
-        node.apply_op1(Tap { slots: slots.clone(), index, output: Mutex::new(Some((values, shape))) })
+    let node =
+        token.apply_op1(Node { gradients: gradients.clone(), wanted, outputs: count, op: Box::new(op) })?;
+    let output_shim = |(index, (values, shape))| {
+        node.apply_op1(OutputShim {
+            gradients: gradients.clone(),
+            index,
+            output: Mutex::new(Some((values, shape))),
+        })
     };
-    outputs.into_iter().enumerate().map(tap).collect()
+    outputs.into_iter().enumerate().map(output_shim).collect()
 }
 
 /// [`record`] for one output.
@@ -163,12 +168,12 @@ pub fn record_one(
 
 /// Gradients on their way past the tokens.
 #[derive(Default)]
-struct Slots {
+struct ShimGradients {
     outputs: Vec<Option<Tensor>>,
     inputs: Vec<Option<Tensor>>,
 }
 
-type Shared = Arc<Mutex<Slots>>;
+type Shared = Arc<Mutex<ShimGradients>>;
 
 fn token() -> Result<(CpuStorage, Shape)> {
     Ok((CpuStorage::F32(vec![0.0]), Shape::from(1)))
@@ -179,26 +184,26 @@ fn token_grad() -> Result<Tensor> {
 }
 
 /// Hands gradients to up to three inputs.
-struct Link {
-    slots: Shared,
+struct InputShim {
+    gradients: Shared,
     first: usize,
     count: usize,
 }
 
-impl Link {
+impl InputShim {
     fn take(&self) -> [Option<Tensor>; 3] {
-        let mut slots = self.slots.lock().unwrap_or_else(PoisonError::into_inner);
+        let mut gradients = self.gradients.lock().unwrap_or_else(PoisonError::into_inner);
         let mut take = |index| {
-            let slot = if index < self.count { slots.inputs.get_mut(self.first + index) } else { None };
+            let slot = if index < self.count { gradients.inputs.get_mut(self.first + index) } else { None };
             slot.and_then(Option::take)
         };
         [take(0), take(1), take(2)]
     }
 }
 
-impl CustomOp1 for Link {
+impl CustomOp1 for InputShim {
     fn name(&self) -> &'static str {
-        "link"
+        "input-shim"
     }
 
     fn cpu_fwd(&self, _: &CpuStorage, _: &Layout) -> Result<(CpuStorage, Shape)> {
@@ -211,9 +216,9 @@ impl CustomOp1 for Link {
     }
 }
 
-impl CustomOp2 for Link {
+impl CustomOp2 for InputShim {
     fn name(&self) -> &'static str {
-        "link"
+        "input-shim"
     }
 
     fn cpu_fwd(&self, _: &CpuStorage, _: &Layout, _: &CpuStorage, _: &Layout) -> Result<(CpuStorage, Shape)> {
@@ -232,9 +237,9 @@ impl CustomOp2 for Link {
     }
 }
 
-impl CustomOp3 for Link {
+impl CustomOp3 for InputShim {
     fn name(&self) -> &'static str {
-        "link"
+        "input-shim"
     }
 
     fn cpu_fwd(
@@ -262,12 +267,12 @@ impl CustomOp3 for Link {
     }
 }
 
-/// A link whose first input is the token of the link before.
-struct Chained(Link);
+/// One whose first input is the token of the shim before.
+struct Chained(InputShim);
 
 impl CustomOp2 for Chained {
     fn name(&self) -> &'static str {
-        "link"
+        "input-shim"
     }
 
     fn cpu_fwd(&self, _: &CpuStorage, _: &Layout, _: &CpuStorage, _: &Layout) -> Result<(CpuStorage, Shape)> {
@@ -288,7 +293,7 @@ impl CustomOp2 for Chained {
 
 impl CustomOp3 for Chained {
     fn name(&self) -> &'static str {
-        "link"
+        "input-shim"
     }
 
     fn cpu_fwd(
@@ -318,7 +323,7 @@ impl CustomOp3 for Chained {
 
 /// The op itself.
 struct Node {
-    slots: Shared,
+    gradients: Shared,
     wanted: Vec<bool>,
     outputs: usize,
     op: Box<dyn Backward>,
@@ -334,7 +339,7 @@ impl CustomOp1 for Node {
     }
 
     fn bwd(&self, _: &Tensor, _: &Tensor, _: &Tensor) -> Result<Option<Tensor>> {
-        let lock = || self.slots.lock().unwrap_or_else(PoisonError::into_inner);
+        let lock = || self.gradients.lock().unwrap_or_else(PoisonError::into_inner);
         let mut grads = std::mem::take(&mut lock().outputs);
         grads.resize(self.outputs, None);
         let grads = self.op.backward(&grads, &self.wanted)?;
@@ -345,32 +350,34 @@ impl CustomOp1 for Node {
 }
 
 /// One of its outputs.
-struct Tap {
-    slots: Shared,
+struct OutputShim {
+    gradients: Shared,
     index: usize,
     output: Mutex<Option<(Vec<f32>, Shape)>>,
 }
 
-impl CustomOp1 for Tap {
+impl CustomOp1 for OutputShim {
     fn name(&self) -> &'static str {
-        "tap"
+        "output-shim"
     }
 
     fn cpu_fwd(&self, _: &CpuStorage, _: &Layout) -> Result<(CpuStorage, Shape)> {
         let output = self.output.lock().unwrap_or_else(PoisonError::into_inner).take();
-        let Some((values, shape)) = output else { candle_core::bail!("tap: its output was taken before") };
+        let Some((values, shape)) = output else {
+            candle_core::bail!("output shim: its output was taken before")
+        };
         if values.len() != shape.elem_count() {
-            candle_core::bail!("tap: {} numbers for the shape {shape:?}", values.len());
+            candle_core::bail!("output shim: {} numbers for the shape {shape:?}", values.len());
         }
         Ok((CpuStorage::F32(values), shape))
     }
 
     fn bwd(&self, _: &Tensor, _: &Tensor, grad: &Tensor) -> Result<Option<Tensor>> {
-        let mut slots = self.slots.lock().unwrap_or_else(PoisonError::into_inner);
-        if slots.outputs.len() <= self.index {
-            slots.outputs.resize(self.index + 1, None);
+        let mut gradients = self.gradients.lock().unwrap_or_else(PoisonError::into_inner);
+        if gradients.outputs.len() <= self.index {
+            gradients.outputs.resize(self.index + 1, None);
         }
-        slots.outputs[self.index] = Some(grad.contiguous()?);
+        gradients.outputs[self.index] = Some(grad.contiguous()?);
         Ok(Some(token_grad()?))
     }
 }

@@ -295,7 +295,7 @@ fn stacks_of_convolutions_equal_layer_after_layer() {
 }
 
 #[test]
-fn the_painted_loss_is_the_loss_of_the_painted_pictures() {
+fn the_reconstruction_loss_is_that_of_the_decoded_pictures() {
     let bytes: Vec<u8> = (0..2 * 16 * 16 * 3).map(|i| (i * 91 % 256) as u8).collect();
     let image = Tensor::from_vec(bytes, (2, 16, 16, 3), &Device::Cpu).unwrap();
     let mask = uniform(&[2, 16, 16], 5, 0.0, 1.0);
@@ -312,8 +312,12 @@ fn the_painted_loss_is_the_loss_of_the_painted_pictures() {
         &robot,
         |x| {
             let (a, b) = both(x);
-            painted_loss(&[(&a[0], &stack_layers(&a)), (&b[0], &stack_layers(&b))], &image, Some(&mask))
-                .map(all)
+            reconstruction_loss(
+                &[(&a[0], &stack_layers(&a)), (&b[0], &stack_layers(&b))],
+                &image,
+                Some(&mask),
+            )
+            .map(all)
         },
         |x| {
             let (a, b) = both(x);

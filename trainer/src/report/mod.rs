@@ -7,7 +7,7 @@
 //! | file | holds |
 //! | --- | --- |
 //! | `parts` | parts on disk |
-//! | `made` | when, with what and on which machine |
+//! | `provenance` | when, with what and on which machine |
 //! | `success` | a policy in closed loop |
 //! | `dynamics` | a model on recorded trajectories, and its attention |
 //! | `results` | result files that were measured elsewhere |
@@ -20,20 +20,20 @@
 mod dynamics;
 mod html;
 mod learning;
-mod made;
 mod page;
 mod parts;
 mod pooled;
+mod provenance;
 mod results;
 mod sections;
 mod success;
 
 pub use dynamics::{AttentionPart, AttentionSource, Dynamics, DynamicsSource, Subject, UNDISTURBED};
 pub use learning::{Learning, LearningCurve, LearningPoint, LearningRun, LearningSource};
-pub use made::{Made, shown_path, shown_words};
 pub use page::Report;
 pub use parts::{Draft, Measurement, Part, Store};
 pub use pooled::{Pooled, SuccessComparison};
+pub use provenance::{Provenance, shown_path, shown_words};
 pub use results::{ResultEntry, Results, ResultsSource};
 pub use success::{Policy, Success, SuccessFilm, SuccessSource, Tick, policies};
 

@@ -6,7 +6,7 @@ use rcwm_models::settings::ModelKind;
 use serde::Serialize;
 
 use super::{
-    AttentionPart, Dynamics, Learning, LearningCurve, Made, Part, Pooled, ReportError, Results, Store,
+    AttentionPart, Dynamics, Learning, LearningCurve, Part, Pooled, Provenance, ReportError, Results, Store,
     Success, SuccessComparison, html, pooled, sections, success,
 };
 use crate::evaluation::{Comparison, OverSeeds, Trained};
@@ -23,7 +23,7 @@ pub struct Report {
     /// Version of the format.
     pub format: u32,
     /// When the page was drawn.
-    pub made: Made,
+    pub made: Provenance,
     /// The command line that drew it.
     pub command: String,
     /// Policies in closed loop.
@@ -77,7 +77,7 @@ impl Report {
     ///
     /// # Errors
     /// See [`ReportError`].
-    pub fn read(store: &Store, made: Made, command: String) -> Result<Self, ReportError> {
+    pub fn read(store: &Store, made: Provenance, command: String) -> Result<Self, ReportError> {
         let mut dynamics: Vec<Part<Dynamics>> = store.all()?;
         // RCWM first: it has the first colour everywhere.
         let is_baseline = |part: &Part<Dynamics>| part.measured.checkpoint.model.kind == ModelKind::Vanilla;
@@ -200,7 +200,7 @@ fn compared(parts: &[Part<Dynamics>]) -> Vec<Compared> {
 
 #[cfg(test)]
 mod tests {
-    use rcwm_models::bundle::Provenance;
+    use rcwm_models::bundle;
     use rcwm_models::settings::{ModelSettings, Preset};
 
     use super::*;
@@ -211,7 +211,7 @@ mod tests {
     use crate::report::{DynamicsSource, SuccessFilm, SuccessSource};
 
     fn page(store: &Store) -> String {
-        Report::read(store, Made::now("cpu"), "rcwm-trainer evaluate --report r".into())
+        Report::read(store, Provenance::now("cpu"), "rcwm-trainer evaluate --report r".into())
             .unwrap()
             .html()
             .unwrap()
@@ -235,7 +235,7 @@ mod tests {
         };
         let mut draft = store.draft::<Success>(&source).unwrap();
         std::fs::write(draft.picture("solved.gif"), b"GIF89a").unwrap();
-        let provenance = Provenance {
+        let provenance = bundle::Provenance {
             preset: "debug".into(),
             data: "data".into(),
             updates: 1,
@@ -257,7 +257,7 @@ mod tests {
             model: ModelSettings::preset(Preset::Debug, ModelKind::Rcwm),
             provenance,
         };
-        store.keep(draft, source, success, Made::now("cpu"), 1.0).unwrap();
+        store.keep(draft, source, success, Provenance::now("cpu"), 1.0).unwrap();
     }
 
     #[test]
@@ -287,7 +287,7 @@ mod tests {
         let folder = tempfile::tempdir().unwrap();
         let store = Store::open(folder.path()).unwrap();
         keep(&store, "policy", false);
-        let report = Report::read(&store, Made::now("cpu"), String::new()).unwrap();
+        let report = Report::read(&store, Provenance::now("cpu"), String::new()).unwrap();
         report.write(folder.path()).unwrap();
         let text = std::fs::read(folder.path().join("report.json")).unwrap();
         let json: serde_json::Value = serde_json::from_slice(&text).unwrap();
@@ -344,7 +344,7 @@ mod tests {
         }
         let (episode_of, robot_errors) = (vec![0, 0, 1], vec![Some(error); 3]);
         let found = Dynamics { checkpoint, report, episode_of, robot_errors, response_pictures: vec![1] };
-        store.keep(draft, source, found, Made::now("cpu"), 1.0).unwrap();
+        store.keep(draft, source, found, Provenance::now("cpu"), 1.0).unwrap();
     }
 
     #[test]
@@ -355,7 +355,7 @@ mod tests {
             keep_dynamics(&store, ModelKind::Rcwm, seed, error);
             keep_dynamics(&store, ModelKind::Vanilla, seed, 4.0);
         }
-        let report = Report::read(&store, Made::now("cpu"), String::new()).unwrap();
+        let report = Report::read(&store, Provenance::now("cpu"), String::new()).unwrap();
         let [part] = report.over_seeds.as_slice() else { panic!("{:?}", report.over_seeds) };
         let comparison = &part.over.comparisons[0];
         let interval = comparison.interval.unwrap();
@@ -381,13 +381,13 @@ mod tests {
         let store = Store::open(folder.path()).unwrap();
         keep_training(&store, "first", true, 0);
         keep_training(&store, "second", false, 1);
-        let report = Report::read(&store, Made::now("cpu"), String::new()).unwrap();
+        let report = Report::read(&store, Provenance::now("cpu"), String::new()).unwrap();
         let [pooled] = report.policies_over_seeds.0.as_slice() else { panic!("two trainings") };
         assert_eq!((pooled.label.as_str(), pooled.rates.clone()), ("first, second", vec![1.0, 0.0]));
         assert!(report.html().unwrap().contains("2 seeds; fewer than 5: no result yet"));
         // The same seed twice is no second training.
         keep_training(&store, "second", false, 0);
-        let report = Report::read(&store, Made::now("cpu"), String::new()).unwrap();
+        let report = Report::read(&store, Provenance::now("cpu"), String::new()).unwrap();
         assert!(report.policies_over_seeds.0.is_empty());
     }
 }

@@ -8,7 +8,7 @@ use rcwm_models::lock::Lock;
 use serde::de::DeserializeOwned;
 use serde::{Deserialize, Serialize};
 
-use super::{Made, ReportError};
+use super::{Provenance, ReportError};
 
 /// Version of the parts' format.
 const FORMAT: u32 = 1;
@@ -37,7 +37,7 @@ pub struct Part<M: Measurement> {
     /// What it was measured from.
     pub source: M::Source,
     /// When and where.
-    pub made: Made,
+    pub made: Provenance,
     /// How long it took.
     pub seconds: f64,
     /// File names of its pictures.
@@ -118,7 +118,7 @@ impl Store {
         draft: Draft,
         source: M::Source,
         measured: M,
-        made: Made,
+        made: Provenance,
         seconds: f64,
     ) -> Result<(), ReportError> {
         let file = self.file::<M>(&source);
@@ -229,7 +229,7 @@ mod tests {
     fn measure(store: &Store, source: &Ruler, metres: f64) {
         let mut draft = store.draft::<Height>(source).unwrap();
         fs::write(draft.picture("a.png"), b"picture").unwrap();
-        store.keep(draft, source.clone(), Height { metres }, Made::now("cpu"), 0.1).unwrap();
+        store.keep(draft, source.clone(), Height { metres }, Provenance::now("cpu"), 0.1).unwrap();
     }
 
     #[test]

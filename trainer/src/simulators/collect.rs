@@ -103,7 +103,7 @@ impl Collected {
 
 /// Progress of a collection.
 #[derive(Debug, Clone, Copy)]
-pub enum Seen {
+pub enum Progress {
     /// A step of an episode.
     Step,
     /// A whole episode was written.
@@ -119,9 +119,9 @@ pub fn collect(
     plan: &Plan,
     settings: &CollectSettings,
     stop: &AtomicBool,
-    seen: &(dyn Fn(Seen) + Sync),
+    progress: &(dyn Fn(Progress) + Sync),
 ) -> Result<Sums, CollectError> {
-    run_jobs(plan, settings, stop, seen, &|job, recorded| {
+    run_jobs(plan, settings, stop, progress, &|job, recorded| {
         recorded.episode.write(&job.file(&settings.out, settings.seed, recorded.number))?;
         Ok(())
     })
@@ -136,9 +136,9 @@ pub fn collect_disturbed(
     plan: &Plan,
     settings: &CollectSettings,
     stop: &AtomicBool,
-    seen: &(dyn Fn(Seen) + Sync),
+    progress: &(dyn Fn(Progress) + Sync),
 ) -> Result<(), CollectError> {
-    run_jobs(plan, settings, stop, seen, &|job, recorded| {
+    run_jobs(plan, settings, stop, progress, &|job, recorded| {
         let path = job.file(&settings.out, settings.seed, recorded.number);
         let (mut episode, again) = (Episode::read(&path)?, &recorded.episode);
         if (&episode.action, &episode.reward) != (&again.action, &again.reward) {
@@ -157,7 +157,7 @@ fn run_jobs(
     plan: &Plan,
     settings: &CollectSettings,
     stop: &AtomicBool,
-    seen: &(dyn Fn(Seen) + Sync),
+    progress: &(dyn Fn(Progress) + Sync),
     keep: Keep<'_>,
 ) -> Result<Sums, CollectError> {
     let mut locks = BTreeMap::new();
@@ -178,7 +178,7 @@ fn run_jobs(
         while let (false, Some(job)) = (ended(stop, &failed), take()) {
             let instance = format!("collect-{}-{number}-{run}", std::process::id());
             run += 1;
-            if let Err(error) = run_job(job, &instance, settings, stop, seen, keep, &mut sums) {
+            if let Err(error) = run_job(job, &instance, settings, stop, progress, keep, &mut sums) {
                 failed.store(true, Ordering::Relaxed);
                 return Err(error);
             }
@@ -218,7 +218,7 @@ fn run_job(
     instance: &str,
     settings: &CollectSettings,
     stop: &AtomicBool,
-    seen: &(dyn Fn(Seen) + Sync),
+    progress: &(dyn Fn(Progress) + Sync),
     keep: Keep<'_>,
     sums: &mut Sums,
 ) -> Result<(), CollectError> {
@@ -238,15 +238,15 @@ fn run_job(
     })?;
     let mut recorder = Recorder::new(Client::of(process)?);
     // The simulator decides by itself: an answer is a receipt.
-    while let Some(recorded) = recorder.episode(stop, || [0.0; ACTION_LEN], || seen(Seen::Step))? {
+    while let Some(recorded) = recorder.episode(stop, || [0.0; ACTION_LEN], || progress(Progress::Step))? {
         keep(job, &recorded)?;
         sums.entry((job.task.clone(), job.script.name().to_owned())).or_default().add(&recorded.episode);
-        seen(Seen::Episode);
+        progress(Progress::Episode);
     }
     Ok(())
 }
 
-/// Records episodes of a simulator that runs already, until `episodes` were seen or it ends. Every observation is answered by a
+/// Records episodes of a simulator that runs already, until `episodes` were progress or it ends. Every observation is answered by a
 /// random action: a scripted simulator takes it as a receipt, one that waits for a policy executes it.
 ///
 /// # Errors
@@ -257,20 +257,20 @@ pub fn record(
     out: &Path,
     seed: u64,
     stop: &AtomicBool,
-    seen: &(dyn Fn(Seen) + Sync),
+    progress: &(dyn Fn(Progress) + Sync),
 ) -> Result<Sums, CollectError> {
     let mut random = ChaCha8Rng::seed_from_u64(seed);
     let mut recorder = Recorder::new(Client::join(instance)?);
     let mut sums = Sums::new();
     for _ in 0..episodes {
         let decide = || std::array::from_fn(|_| random.random_range(-1.0..=1.0));
-        let recorded = recorder.episode(stop, decide, || seen(Seen::Step))?;
+        let recorded = recorder.episode(stop, decide, || progress(Progress::Step))?;
         let Some(Recorded { number, task, episode }) = recorded else { break };
         let folder = out.join(task_name(task));
         make_folder(&folder)?;
         write_numbered(&episode, &folder.join(format!("{instance}-{number:05}.npz")))?;
         sums.entry((task_name(task).to_owned(), instance.to_owned())).or_default().add(&episode);
-        seen(Seen::Episode);
+        progress(Progress::Episode);
     }
     Ok(sums)
 }

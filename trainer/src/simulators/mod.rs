@@ -17,6 +17,8 @@ mod process;
 mod recorder;
 
 pub use client::{Client, ClientError};
-pub use collect::{CollectError, CollectSettings, Collected, Seen, Sums, collect, collect_disturbed, record};
+pub use collect::{
+    CollectError, CollectSettings, Collected, Progress, Sums, collect, collect_disturbed, record,
+};
 pub use plan::{Amounts, Job, Plan, Script};
 pub use process::{Launch, ProcessError, Program, RunningProgram, SimulatorProcess};

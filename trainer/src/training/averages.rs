@@ -51,7 +51,7 @@ impl Averages {
 
 /// What time was spent on.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord)]
-pub enum Spent {
+pub enum TimeBucket {
     /// Updates.
     Learning,
     /// Deciding on actions, and keeping what came of them.
@@ -64,7 +64,7 @@ pub enum Spent {
     WaitingForBatches,
 }
 
-impl Spent {
+impl TimeBucket {
     const fn name(self) -> &'static str {
         match self {
             Self::Learning => "learning_share",
@@ -108,7 +108,7 @@ impl Line {
 pub struct Interval {
     begin: Instant,
     updates: u64,
-    spent: BTreeMap<Spent, Duration>,
+    spent: BTreeMap<TimeBucket, Duration>,
     averages: Averages,
 }
 
@@ -127,7 +127,7 @@ impl Interval {
     }
 
     /// Runs `work` and counts its time.
-    pub fn time<T>(&mut self, on: Spent, work: impl FnOnce() -> T) -> T {
+    pub fn time<T>(&mut self, on: TimeBucket, work: impl FnOnce() -> T) -> T {
         let begin = Instant::now();
         let result = work();
         self.add(on, begin.elapsed());
@@ -135,7 +135,7 @@ impl Interval {
     }
 
     /// Counts time that was spent.
-    pub fn add(&mut self, on: Spent, time: Duration) {
+    pub fn add(&mut self, on: TimeBucket, time: Duration) {
         *self.spent.entry(on).or_default() += time;
     }
 

@@ -120,7 +120,7 @@ impl WorldUpdates {
             mode: false,
         };
         let mut learner = GpuLearner::new(machine, &plan, parameters)?;
-        learner.load(Array::Average, &run.kept(parameters))?;
+        learner.load(Array::Average, &run.ema_weights(parameters))?;
         learner.resume(&adam)?;
         for (place, episode) in episodes {
             learner.store(place, &episode)?;

@@ -8,9 +8,9 @@ use rcwm_models::settings::ModelKind;
 use serde_json::json;
 
 use super::film::{Scene, write_films};
-use super::run::GoesOn;
+use super::run::Resume;
 use super::{
-    Best, FewshotSettings, Interval, Line, Outcome, Phase, Run, Spent, TrainingError, TrainingSettings,
+    Best, FewshotSettings, Interval, Line, Outcome, Phase, Run, TimeBucket, TrainingError, TrainingSettings,
     TrainingState, start_from,
 };
 use crate::checkpoint::Checkpoint;
@@ -148,11 +148,11 @@ impl Fewshot {
     pub fn resume(folder: &Path, settings: TrainingSettings, device: &Device) -> Result<Self, TrainingError> {
         let (run, parameters, state, moments) =
             match Run::go_on(folder, &settings, &[Phase::Fewshot], device)? {
-                GoesOn::FromStart(run) => {
+                Resume::FromStart(run) => {
                     let source = Checkpoint::read(&settings.from, device)?;
                     return Self::fresh(run, settings, &source, device);
                 }
-                GoesOn::From { run, parameters, state, moments } => (run, parameters, state, moments),
+                Resume::From { run, parameters, state, moments } => (run, parameters, state, moments),
             };
         let mut this = Self::of(run, settings, parameters, state, device)?;
         let adam = |name: &str, settings| this.state.optimiser(name, settings, &moments, &this.parameters);
@@ -203,7 +203,7 @@ impl Fewshot {
             self.update(stage, number, &mut work, &mut interval)?;
             self.state.updates += 1;
             let updates = self.state.updates;
-            self.run.follow(&self.parameters, self.moved(stage), updates)?;
+            self.run.ema_update(&self.parameters, self.moved(stage), updates)?;
             let line = updates
                 .is_multiple_of(self.settings.metrics_every)
                 .then(|| interval.end(updates, stage.name()));
@@ -243,7 +243,7 @@ impl Fewshot {
         work.stage = Some(stage);
         if stage == Stage::Actor && number == 0 {
             // The actor learns on the states that the deployed world model will give it.
-            self.parameters.mix(&self.run.kept(&self.parameters), 1.0, |_| true)?;
+            self.parameters.mix(&self.run.ema_weights(&self.parameters), 1.0, |_| true)?;
         }
         let fewshot = &self.settings.fewshot;
         let imitation = Imitation {
@@ -289,9 +289,9 @@ impl Fewshot {
             return self.clone_from_examples(number, examples, &mut sampler, interval);
         }
         let batches = work.batches.as_mut().expect("entering a stage that draws batches starts them");
-        let batch = interval.time(Spent::WaitingForBatches, || batches.next_batch())?;
+        let batch = interval.time(TimeBucket::WaitingForBatches, || batches.next_batch())?;
         let batch = batch.into_tensors(&self.device)?;
-        let update = interval.time(Spent::Learning, || self.world.update(&batch, &mut sampler))?;
+        let update = interval.time(TimeBucket::Learning, || self.world.update(&batch, &mut sampler))?;
         let losses = json!({"losses": update.losses, "gradient_norm": update.gradient_norm});
         if stage == Stage::Actor {
             let examples = Examples::of_batch(&update.posteriors.features()?, &batch)?;
@@ -311,7 +311,7 @@ impl Fewshot {
         let settings = &self.settings.fewshot.cloning;
         let (rows, starts) = (settings.rows, settings.imagination_rows);
         let seed = self.settings.seed ^ ROWS_STREAM;
-        let update = interval.time(Spent::Learning, || {
+        let update = interval.time(TimeBucket::Learning, || {
             let (features, actions) = examples.draw(rows.max(starts), seed, self.state.updates)?;
             let start = || state_of_features(&features.narrow(0, 0, starts)?, &self.settings.model);
             let (few, taken) = (features.narrow(0, 0, rows)?, actions.narrow(0, 0, rows)?);
@@ -331,7 +331,7 @@ impl Fewshot {
         interval: &mut Interval,
     ) -> Result<(), TrainingError> {
         let starts = self.settings.fewshot.cloning.imagination_rows.min(features.dim(0)?);
-        let update = interval.time(Spent::Learning, || {
+        let update = interval.time(TimeBucket::Learning, || {
             let start = || state_of_features(&features.narrow(0, 0, starts)?, &self.settings.model);
             self.cloning.update(number, &features, &actions, start, sampler)
         })?;
@@ -355,7 +355,7 @@ impl Fewshot {
         let [world_name, actor_name, critic_name] = OPTIMISERS;
         let optimisers = [(world_name, self.world.adam()), (actor_name, actor), (critic_name, critic)];
         self.run.save(&self.parameters, &self.settings, &self.state, &optimisers, Best::No)?;
-        let agent = Agent::new(&self.run.kept(&self.parameters).frozen(), &self.settings.model)?;
+        let agent = Agent::new(&self.run.ema_weights(&self.parameters).frozen(), &self.settings.model)?;
         if !self.held_out.is_empty() {
             let cloning = self.held_out_cloning(&agent)?;
             self.run.log(&json!({"update": self.state.updates, "held_out": {"cloning": cloning}}))?;

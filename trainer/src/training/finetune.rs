@@ -10,16 +10,16 @@ use super::compute::{AgentUpdates, Compute};
 use super::evaluations::evaluate;
 use super::film::{Scene, write_films};
 use super::prefill::{Prefilled, policy_episode, prefill};
-use super::run::GoesOn;
+use super::run::Resume;
 use super::{EpisodeFacts, EpisodeLine, EvaluationLine, OnlineOutcome, OnlineProgress};
-use super::{Interval, Phase, Run, Spent, TrainingError, TrainingSettings, TrainingState, start_from};
+use super::{Interval, Phase, Run, TimeBucket, TrainingError, TrainingSettings, TrainingState, start_from};
 use crate::acting::{Fleet, Gathered, Policy, Recorded};
 use crate::checkpoint::Checkpoint;
 use crate::model::agent::{self, Agent};
 use crate::model::latent::Sampler;
 use crate::model::parameters::{ParameterError, Parameters};
 use crate::replay::{Prefetch, SharedReplay};
-use crate::simulators::{Launch, Script, Seen};
+use crate::simulators::{Launch, Progress, Script};
 
 /// Names of the optimisers in checkpoints.
 const OPTIMISERS: [&str; 3] = ["world", "actor", "critic"];
@@ -136,14 +136,14 @@ impl Finetuning {
         let device = compute.device();
         let phases = [Phase::Finetune, Phase::Train];
         let (run, parameters, state, moments) = match Run::go_on(folder, &settings, &phases, &device)? {
-            GoesOn::FromStart(run) => {
+            Resume::FromStart(run) => {
                 let source = match settings.phase {
                     Phase::Finetune => Some(Checkpoint::read(&settings.from, &device)?),
                     _ => None,
                 };
                 return Self::fresh(folder, run, settings, source.as_ref(), compute);
             }
-            GoesOn::From { run, parameters, state, moments } => (run, parameters, state, moments),
+            Resume::From { run, parameters, state, moments } => (run, parameters, state, moments),
         };
         let mut this = Self::of(folder, run, settings, parameters, state, compute)?;
         let adam = |name: &str, settings| this.state.optimiser(name, settings, &moments, &this.parameters);
@@ -175,9 +175,9 @@ impl Finetuning {
     pub fn prefill(
         &mut self,
         stop: &AtomicBool,
-        seen: &(dyn Fn(Seen) + Sync),
+        progress: &(dyn Fn(Progress) + Sync),
     ) -> Result<Prefilled, TrainingError> {
-        prefill(&self.folder, &self.settings, stop, seen)
+        prefill(&self.folder, &self.settings, stop, progress)
     }
 
     /// Acts and learns until all steps are made, every simulator has ended, or `stop` is set; any way ends with a checkpoint.
@@ -235,7 +235,7 @@ impl Finetuning {
         let agent = Agent::new(&self.parameters.frozen(), &self.settings.model)?;
         let mut policy = Policy::new(agent, fleet.len(), &self.device);
         while self.state.policy_steps < steps && !stop.load(Ordering::Relaxed) {
-            let gathered = learning.interval.time(Spent::WaitingForSimulators, || fleet.gather(stop))?;
+            let gathered = learning.interval.time(TimeBucket::WaitingForSimulators, || fleet.gather(stop))?;
             if gathered.is_empty() {
                 break;
             }
@@ -246,7 +246,7 @@ impl Finetuning {
                     self.keep(recorded, replay, show)?;
                 }
             }
-            learning.interval.add(Spent::Acting, begin.elapsed());
+            learning.interval.add(TimeBucket::Acting, begin.elapsed());
             drop(gathered);
             self.learn(learning, stop, show)?;
             self.evaluate(learning, stop, show)?;
@@ -295,8 +295,9 @@ impl Finetuning {
         self.write_back()?;
         let agent = Agent::new(&self.parameters.frozen(), &self.settings.model)?;
         let steps = (self.state.policy_steps, ACTION_REPEAT * self.state.policy_steps);
-        let found =
-            learning.interval.time(Spent::Evaluating, || evaluate(agent, &self.settings, steps, stop))?;
+        let found = learning
+            .interval
+            .time(TimeBucket::Evaluating, || evaluate(agent, &self.settings, steps, stop))?;
         if let Some(evaluation) = found {
             self.evaluations = due;
             let line = EvaluationLine { update: self.state.updates, phase: ONLINE, evaluation };
@@ -380,10 +381,11 @@ impl Finetuning {
     fn update(&mut self, learning: &mut Learning) -> Result<&'static str, TrainingError> {
         let Learning { batches, interval } = learning;
         let number = self.state.updates;
-        let batch = interval.time(Spent::WaitingForBatches, || batches.next_batch())?;
+        let batch = interval.time(TimeBucket::WaitingForBatches, || batches.next_batch())?;
         let warm_up = number < self.settings.finetune.warm_up_updates;
-        let (world, behaviour) = interval
-            .time(Spent::Learning, || self.updates.update(batch, (self.settings.seed, number), !warm_up))?;
+        let (world, behaviour) = interval.time(TimeBucket::Learning, || {
+            self.updates.update(batch, (self.settings.seed, number), !warm_up)
+        })?;
         let mut values = json!({"losses": world.losses, "gradient_norm": world.gradient_norm});
         if let Some(behaviour) = behaviour {
             values["behaviour"] = json!(behaviour);

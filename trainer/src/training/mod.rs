@@ -56,7 +56,7 @@ mod state;
 mod tensorboard;
 mod weight_average;
 
-pub use averages::{Averages, Interval, Line, Spent};
+pub use averages::{Averages, Interval, Line, TimeBucket};
 pub use compute::Compute;
 pub use demonstrations::demonstrations;
 pub use evaluations::{EvaluationFacts, EvaluationLine, EvaluationSettings};

@@ -5,7 +5,7 @@ use rcwm_models::episode::Episode;
 
 use super::{FinetuneSettings, TrainingError, TrainingSettings};
 use crate::replay::{Folder, LoadError, Replay};
-use crate::simulators::{Amounts, CollectSettings, Plan, Script, Seen, collect};
+use crate::simulators::{Amounts, CollectSettings, Plan, Progress, Script, collect};
 
 /// Times that experts are recorded again for those that did not succeed.
 const EXPERT_ROUNDS: u32 = 3;
@@ -38,11 +38,11 @@ pub fn prefill(
     run: &Path,
     settings: &TrainingSettings,
     stop: &AtomicBool,
-    seen: &(dyn Fn(Seen) + Sync),
+    progress: &(dyn Fn(Progress) + Sync),
 ) -> Result<Prefilled, TrainingError> {
     let mut filled = Filled::new(settings);
     if settings.data.as_os_str().is_empty() {
-        record(run, settings, stop, seen)?;
+        record(run, settings, stop, progress)?;
     } else {
         filled.take_from_data(&settings.data)?;
     }
@@ -137,7 +137,7 @@ fn record(
     run: &Path,
     settings: &TrainingSettings,
     stop: &AtomicBool,
-    seen: &(dyn Fn(Seen) + Sync),
+    progress: &(dyn Fn(Progress) + Sync),
 ) -> Result<(), TrainingError> {
     let finetune = &settings.finetune;
     let collecting = CollectSettings {
@@ -154,7 +154,7 @@ fn record(
         let amounts = Amounts { masked: if finetune.masks { amounts.total() } else { 0 }, ..amounts };
         let tasks = [settings.task.clone()];
         let plan = Plan::new(&collecting.out, &tasks, &amounts, settings.seed, EPISODES_A_RUN);
-        collect(&plan, &collecting, stop, seen)?;
+        collect(&plan, &collecting, stop, progress)?;
         let missing = finetune.expert_episodes.saturating_sub(successes(&collecting.out, &settings.task)?);
         if missing == 0 || round + 1 == EXPERT_ROUNDS || stop.load(Ordering::Relaxed) {
             break;

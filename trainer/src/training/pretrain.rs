@@ -7,7 +7,7 @@ use candle_core::Device;
 use super::compute::{Compute, WorldStep, WorldUpdates};
 use super::film::{Scene, write_films};
 use super::held_out::{HeldOut, mean_losses};
-use super::run::GoesOn;
+use super::run::Resume;
 use super::{Best, HeldOutLosses, Metrics, Phase, Run, TrainingError, TrainingSettings, TrainingState};
 use crate::learning::{LossValues, Trained};
 use crate::model::agent::{self, Agent};
@@ -87,8 +87,8 @@ impl Pretraining {
         let device = compute.device();
         let (run, parameters, state, moments) =
             match Run::go_on(folder, &settings, &[Phase::Pretrain], &device)? {
-                GoesOn::FromStart(run) => return Self::fresh(run, settings, compute),
-                GoesOn::From { run, parameters, state, moments } => (run, parameters, state, moments),
+                Resume::FromStart(run) => return Self::fresh(run, settings, compute),
+                Resume::From { run, parameters, state, moments } => (run, parameters, state, moments),
             };
         let adam = state.optimiser(WORLD, &settings.world.adam, &moments, &parameters)?;
         let learner = WorldUpdates::new(compute, &settings, &parameters, Some(adam))?;
@@ -107,10 +107,10 @@ impl Pretraining {
         &self.parameters
     }
 
-    /// What a checkpoint would hold of them: see [`Run::kept`].
+    /// What a checkpoint would hold of them: see [`Run::ema_weights`].
     #[must_use]
-    pub fn kept(&self) -> Parameters {
-        self.run.kept(&self.parameters)
+    pub fn ema_weights(&self) -> Parameters {
+        self.run.ema_weights(&self.parameters)
     }
 
     /// Trains until the settings' number of updates is reached or `stop` is set; either way ends with a checkpoint.
@@ -125,7 +125,7 @@ impl Pretraining {
     ) -> Result<Outcome, TrainingError> {
         let (mut replay, mut held_out) = replay.hold_out(self.settings.replay.held_out_episodes);
         self.learner.begin(&self.settings, &self.parameters, &self.run, [&mut replay, &mut held_out])?;
-        let judge = Judge::new(&self.settings, &replay, held_out);
+        let validation = Validation::new(&self.settings, &replay, held_out);
         replay.look(&self.settings.replay.look);
         let mut batches = self.prefetch(replay)?;
         let mut interval = Interval::begin(&batches);
@@ -136,7 +136,7 @@ impl Pretraining {
             let update = self.learner.update(batches.next_batch()?, self.settings.seed, number)?;
             self.state.updates += 1;
             if self.learner.leaves_average() {
-                self.run.follow(&self.parameters, Trained::World.filter(), self.state.updates)?;
+                self.run.ema_update(&self.parameters, Trained::World.filter(), self.state.updates)?;
             }
             interval.means.add(&update);
             since_checkpoint.add(&update);
@@ -151,7 +151,7 @@ impl Pretraining {
             let mut losses = None;
             if saved {
                 let begin = Instant::now();
-                losses = self.save(std::mem::take(&mut since_checkpoint), &judge)?;
+                losses = self.save(std::mem::take(&mut since_checkpoint), &validation)?;
                 // Updates a second are those of training.
                 interval.begin += begin.elapsed();
                 saved_at = Some(self.state.updates);
@@ -160,7 +160,7 @@ impl Pretraining {
             show(&Progress { updates, metrics: metrics.as_ref(), saved, held_out });
         }
         if saved_at != Some(self.state.updates) {
-            self.save(since_checkpoint, &judge)?;
+            self.save(since_checkpoint, &validation)?;
         }
         let interrupted = self.state.updates < self.settings.pretrain.updates;
         Ok(Outcome { updates: self.state.updates, interrupted })
@@ -178,11 +178,15 @@ impl Pretraining {
     }
 
     /// Saves a checkpoint, then judges it, draws the curves and makes films.
-    fn save(&mut self, since: Means, judge: &Judge) -> Result<Option<HeldOutLosses>, TrainingError> {
+    fn save(
+        &mut self,
+        since: Means,
+        validation: &Validation,
+    ) -> Result<Option<HeldOutLosses>, TrainingError> {
         let adam = self.learner.write_back(&self.parameters, &mut self.run)?;
-        let agent = Agent::new(&self.run.kept(&self.parameters).frozen(), &self.settings.model)?;
+        let agent = Agent::new(&self.run.ema_weights(&self.parameters).frozen(), &self.settings.model)?;
         let (sizes, world) = (&self.settings.replay, &self.settings.world);
-        let held_out = judge.held_out.losses(&agent, sizes, world, &self.device, &mut self.learner)?;
+        let held_out = validation.held_out.losses(&agent, sizes, world, &self.device, &mut self.learner)?;
         let best = match &held_out {
             Some(losses) => lower(Some(losses.total), &mut self.state.best_held_out_loss),
             None => lower(since.mask_free_loss(), &mut self.state.best_loss),
@@ -196,19 +200,19 @@ impl Pretraining {
         let optimisers = [(WORLD, &adam)];
         self.run.save(&self.parameters, &self.settings, &self.state, &optimisers, best)?;
         self.run.draw_curves(self.settings.pretrain.warm_up_updates)?;
-        write_films(&self.run, &agent, &judge.scenes, &self.settings.film, update, &self.device)?;
+        write_films(&self.run, &agent, &validation.scenes, &self.settings.film, update, &self.device)?;
         Ok(line)
     }
 }
 
 /// What checkpoints are judged by.
 #[derive(Debug)]
-struct Judge {
+struct Validation {
     held_out: HeldOut,
     scenes: Vec<Scene>,
 }
 
-impl Judge {
+impl Validation {
     /// Films are of held-out episodes; of a task without one, of an episode that is trained on.
     fn new(settings: &TrainingSettings, replay: &Replay, held_out: Replay) -> Self {
         let mut scenes = settings.film.scenes(&held_out);

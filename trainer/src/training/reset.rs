@@ -46,7 +46,7 @@ pub struct ResetSettings {
 impl ResetSettings {
     /// Whether the parameter of this name is drawn anew for a model of this kind.
     #[must_use]
-    pub fn draws_anew(&self, kind: ModelKind, name: &str) -> bool {
+    pub fn reinitialises(&self, kind: ModelKind, name: &str) -> bool {
         match side_of(name) {
             Side::Actor | Side::Critic | Side::SlowCritic => !self.keep_behaviour,
             Side::Robot | Side::Environment => kind == ModelKind::Rcwm && self.parts.holds(name),
@@ -78,7 +78,7 @@ pub fn start_from(
     let model: &ModelSettings = &source.settings.model;
     let specs = agent::specs(model)?;
     let anew: Vec<ParameterSpec> =
-        specs.iter().filter(|spec| settings.draws_anew(model.kind, &spec.name)).cloned().collect();
+        specs.iter().filter(|spec| settings.reinitialises(model.kind, &spec.name)).cloned().collect();
     let fresh = Parameters::initialise(&anew, seed, device)?;
     let kept = source.parameters.iter().map(|(name, var)| {
         let value = fresh.get(name).unwrap_or(var);
@@ -116,7 +116,7 @@ mod tests {
             "decoder.robot.linear.weight",
             "robot.cell.linear.weight",
         ] {
-            assert!(!settings.draws_anew(ModelKind::Rcwm, name), "{name}");
+            assert!(!settings.reinitialises(ModelKind::Rcwm, name), "{name}");
         }
     }
 }

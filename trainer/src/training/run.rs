@@ -69,7 +69,7 @@ fn describe_data(settings: &TrainingSettings) -> String {
 
 /// Where a run goes on.
 #[derive(Debug)]
-pub(super) enum GoesOn {
+pub(super) enum Resume {
     /// From the beginning: it died before its first checkpoint.
     FromStart(Run),
     /// From its newest checkpoint.
@@ -128,7 +128,7 @@ impl Run {
         settings: &TrainingSettings,
         phases: &[Phase],
         device: &Device,
-    ) -> Result<GoesOn, TrainingError> {
+    ) -> Result<Resume, TrainingError> {
         settings.validate()?;
         if !phases.contains(&settings.phase) {
             let found = settings.phase.verb();
@@ -136,7 +136,7 @@ impl Run {
         }
         let lock = Lock::take(folder)?;
         if !Self::has_checkpoint(folder) {
-            return Ok(GoesOn::FromStart(Self::resume(folder, settings, 0, lock)?));
+            return Ok(Resume::FromStart(Self::resume(folder, settings, 0, lock)?));
         }
         let (Checkpoint { settings: stored, parameters }, state, moments) = Self::load(folder, device)?;
         if stored.model != settings.model {
@@ -153,7 +153,7 @@ impl Run {
             }
             None => parameters,
         };
-        Ok(GoesOn::From { run, parameters, state, moments })
+        Ok(Resume::From { run, parameters, state, moments })
     }
 
     /// Goes on with a run: metrics beyond `updates` belong to updates that were lost, and are dropped.
@@ -269,7 +269,7 @@ impl Run {
     ///
     /// # Errors
     /// Those of candle.
-    pub(super) fn follow(
+    pub(super) fn ema_update(
         &mut self,
         parameters: &Parameters,
         trained: impl Fn(&str) -> bool,
@@ -279,7 +279,7 @@ impl Run {
             return Ok(());
         }
         match &mut self.average {
-            Some(average) => Ok(average.follow(parameters, trained, updates)?),
+            Some(average) => Ok(average.ema_update(parameters, trained, updates)?),
             None => {
                 self.average = Some(WeightAverage::of(parameters.copied()?, self.average_decay));
                 Ok(())
@@ -289,7 +289,7 @@ impl Run {
 
     /// What a checkpoint holds when `parameters` are trained: their average, where one is kept.
     #[must_use]
-    pub fn kept(&self, parameters: &Parameters) -> Parameters {
+    pub fn ema_weights(&self, parameters: &Parameters) -> Parameters {
         self.average.as_ref().map_or(parameters, WeightAverage::weights).clone()
     }
 
@@ -344,7 +344,7 @@ impl Run {
                 weights_sha256: String::new(),
                 model: settings.model.clone(),
             },
-            parameters: self.kept(parameters),
+            parameters: self.ema_weights(parameters),
         };
         if best == Best::Yes {
             checkpoint.write(&self.folder.join("checkpoints").join("best"))?;

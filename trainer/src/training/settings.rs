@@ -183,14 +183,14 @@ impl TrainingSettings {
         }
     }
 
-    /// A run of another phase, with what the preset has for it: few-shot learning of `small` goes through whole demonstrations, paints few
+    /// A run of another phase, with what the preset has for it: few-shot learning of `small` goes through whole demonstrations, decodes few
     /// of their steps, and lets the reward say what matters in the scene (tried in `LAB.md`).
     #[must_use]
     pub fn of_phase(phase: Phase, preset: Preset, kind: ModelKind) -> Self {
         let mut settings = Self { phase, ..Self::preset(preset, kind, PathBuf::new()) };
         if (phase, preset) == (Phase::Fewshot, Preset::Small) {
             settings.replay = ReplaySettings { batch: 4, length: 64, ..settings.replay };
-            settings.world.paint_every = 4;
+            settings.world.decode_every = 4;
             settings.world.reward_scale = 10.0;
         }
         settings
@@ -218,10 +218,10 @@ impl TrainingSettings {
         if let Some(text) = replay.look.invalid() {
             return Err(SettingsError::Invalid(text));
         }
-        if !(1..=replay.length).contains(&self.world.paint_every) {
+        if !(1..=replay.length).contains(&self.world.decode_every) {
             return Err(SettingsError::Invalid(format!(
-                "world.paint_every = {}, expected 1 to replay.length = {}",
-                self.world.paint_every, replay.length
+                "world.decode_every = {}, expected 1 to replay.length = {}",
+                self.world.decode_every, replay.length
             )));
         }
         if !(0.0..1.0).contains(&self.average_decay) {

@@ -16,7 +16,7 @@ impl WeightAverage {
     }
 
     /// Follows `parameters`, where `trained` accepts their names, after update number `updates`, from 1.
-    pub(super) fn follow(
+    pub(super) fn ema_update(
         &mut self,
         parameters: &Parameters,
         trained: impl Fn(&str) -> bool,
@@ -57,7 +57,7 @@ mod tests {
             for (_, var) in raw.iter() {
                 var.set(&Tensor::new(&[value], &Device::Cpu).unwrap()).unwrap();
             }
-            average.follow(&raw, |name| name == "robot", u64::from(update)).unwrap();
+            average.ema_update(&raw, |name| name == "robot", u64::from(update)).unwrap();
             let keep = (f64::from(1 + update) / f64::from(10 + update)).min(0.9);
             expected = keep * expected + (1.0 - keep) * f64::from(value);
         }

@@ -93,10 +93,9 @@ impl<T: ZeroCopySend + std::fmt::Debug + 'static> Direction<T> {
 
     pub(super) fn waker(&self) -> Result<Waker, LinkError> {
         let created = self.event.notifier_builder().create();
-        created.map(Waker).map_err(|error| LinkError::Service {
-            service: self.name.clone(),
-            reason: format!("{error:?}"),
-        })
+        created
+            .map(Waker)
+            .map_err(|error| LinkError::Service { service: self.name.clone(), reason: format!("{error:?}") })
     }
 
     pub(super) fn receiver(&self) -> Result<Receiver<T>, LinkError> {

@@ -147,7 +147,7 @@ mod tests {
         let _stuck = ControllerLink::open(settings.clone()).unwrap();
         simulator.poll_events().unwrap();
         say_closed_for(&settings).unwrap();
-        assert!(matches!(simulator.wait_action(SOON).unwrap().0, Wait::Closed));
+        assert!(simulator.wait_action(SOON).unwrap().1.closed);
     }
 
     #[test]

@@ -58,7 +58,11 @@ impl Branches {
     }
 
     /// The same; what has not run yet runs too.
-    pub(super) fn rehearse(&mut self, values: &mut Values, clock: &mut StageClock) -> Result<(), RunError> {
+    pub(super) fn warm_caches(
+        &mut self,
+        values: &mut Values,
+        clock: &mut StageClock,
+    ) -> Result<(), RunError> {
         if let Self::Beside(Beside { spare, spare_is_new, .. }) = self
             && std::mem::take(spare_is_new)
         {
@@ -122,7 +126,7 @@ impl WorkerSlot {
 
 impl Beside {
     fn new(robot: Piece, environment: Piece, team: &SharedTeam) -> Result<Self, PolicyError> {
-        let spare = environment.twin().map_err(|error| super::run_error(environment.part, &error))?;
+        let spare = environment.try_clone().map_err(|error| super::run_error(environment.part, &error))?;
         let work = LaneWork { environment, task: 0, inputs: None, results: None, spent_ns: 0 };
         let slot = Arc::new(WorkerSlot { work: Mutex::new(work), done: AtomicU64::new(0) });
         Ok(Self { team: Arc::clone(team), robot, slot, spare, spare_is_new: true, task: 0 })

@@ -102,7 +102,7 @@ impl Piece {
     fn try_load(segment: &Segment, values: &mut Values, team: Option<&SharedTeam>) -> TractResult<Self> {
         let mut model =
             operators::onnx().model_for_read(&mut &segment.onnx[..])?.into_typed()?.into_decluttered()?;
-        operators::settle(&mut model, team);
+        operators::bind_threads(&mut model, team);
         let state = TypedSimpleState::new(&model.into_optimized()?.into_runnable()?)?;
         let inputs = segment
             .inputs
@@ -115,7 +115,7 @@ impl Piece {
     }
 
     /// The same again, with memory of its own; weights are shared.
-    pub(super) fn twin(&self) -> TractResult<Self> {
+    pub(super) fn try_clone(&self) -> TractResult<Self> {
         let state = TypedSimpleState::new(self.state.plan())?;
         let (inputs, outputs) = (self.inputs.clone(), self.outputs.clone());
         Ok(Self { part: self.part, inputs, outputs, state, unwanted: Some(Unwanted.into()) })

@@ -53,11 +53,11 @@ fn is_critic(name: &str) -> bool {
 }
 
 pub(super) fn check(settings: &LearnerSettings) -> Result<(), GpuError> {
-    let Sizes { model, length, paint_every, .. } = &settings.sizes;
+    let Sizes { model, length, decode_every, .. } = &settings.sizes;
     let refuse = |text: String| Err(GpuError::Unsupported(text));
-    if *paint_every == 0 || !length.is_multiple_of(*paint_every) {
+    if *decode_every == 0 || !length.is_multiple_of(*decode_every) {
         return refuse(format!(
-            "world.paint_every = {paint_every} does not divide replay.length = {length}, as updates on a GPU need"
+            "world.decode_every = {decode_every} does not divide replay.length = {length}, as updates on a GPU need"
         ));
     }
     if !model.cnn_depth.is_multiple_of(4) {
@@ -104,7 +104,7 @@ impl Room {
             reward: words(rows)?,
             terminal: words(rows)?,
             first: words(rows)?,
-            painted: words(rows)?,
+            decoded: words(rows)?,
             noise: words(10)?,
             kl: words(2 * rows)?,
         };

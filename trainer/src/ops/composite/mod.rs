@@ -21,5 +21,5 @@ pub use cell::recurrent_update;
 pub use conv::{conv_down, conv_up};
 pub use linear::linear;
 pub use norm::{layer_norm, layer_norm_silu};
-pub use picture::{image_to_float, painted, picture_loss};
+pub use picture::{image_to_float, picture_loss, reconstruction};
 pub use two_hot::{symexp, symlog, two_hot_loss, two_hot_mean};

@@ -12,11 +12,11 @@ pub fn image_to_float(image: &Tensor) -> Result<Tensor> {
     image.to_dtype(DType::F32)?.broadcast_div(&full)? - 0.5
 }
 
-/// The painted image [..., 3] and its mask [..., 1] of raw decoder outputs [..., 4].
+/// The reconstructed image [..., 3] and its mask [..., 1] of raw decoder outputs [..., 4].
 ///
 /// # Errors
 /// Those of candle.
-pub fn painted(raw: &Tensor) -> Result<(Tensor, Tensor)> {
+pub fn reconstruction(raw: &Tensor) -> Result<(Tensor, Tensor)> {
     Ok((raw.narrow(D::Minus1, 0, 3)?, sigmoid(&raw.narrow(D::Minus1, 3, 1)?)?))
 }
 
@@ -30,7 +30,7 @@ pub fn picture_loss(
     mask: Option<&Tensor>,
 ) -> Result<(Tensor, Option<Tensor>)> {
     let image = image_to_float(image)?;
-    let pictures = raws.iter().map(|raw| painted(raw)).collect::<Result<Vec<_>>>()?;
+    let pictures = raws.iter().map(|raw| reconstruction(raw)).collect::<Result<Vec<_>>>()?;
     let whole = match pictures.as_slice() {
         [(picture, _)] => picture.clone(),
         [(robot, robot_mask), (environment, environment_mask)] => {

@@ -4,7 +4,7 @@ mod attention;
 mod disturbances;
 mod dynamics;
 mod learning;
-mod made;
+mod provenance;
 mod response;
 mod results;
 mod seeds;
@@ -43,7 +43,7 @@ pub(super) fn all(report: &Report) -> Result<Vec<Section>, ReportError> {
         section("disturbances", "Disturbances", disturbances::section(report)?),
         section("comparison", "Comparison of policies", results::section(report)),
         section("learning", "Learning curves", learning::section(report)?),
-        section("made", "How it was made", made::section(report)),
+        section("made", "How it was made", provenance::section(report)),
     ])
 }
 

@@ -4,7 +4,7 @@ use maud::{Markup, html};
 use rcwm_models::settings::{ModelKind, ModelSettings};
 
 use crate::report::html::{Column, table, words};
-use crate::report::{Made, Report};
+use crate::report::{Provenance, Report};
 
 /// Command line, machine, models and parts.
 pub(super) fn section(report: &Report) -> Markup {
@@ -128,7 +128,7 @@ fn parts(report: &Report) -> Markup {
     table(&columns, &rows)
 }
 
-fn row(what: String, how: String, made: &Made, seconds: f64) -> Vec<Option<Markup>> {
+fn row(what: String, how: String, made: &Provenance, seconds: f64) -> Vec<Option<Markup>> {
     let machine = format!(
         "{}, {} cores, {}; version {} ({})",
         made.processor, made.cores, made.device, made.version, made.revision

@@ -14,18 +14,18 @@ pub struct Case {
     #[serde(flatten)]
     pub settings: EngineSettings,
     /// Whether it gets ready before an image is expected, as a controller does.
-    pub rehearses: bool,
+    pub warms_caches: bool,
 }
 
-/// ONNX Runtime as the yardstick: the five exported parts one after another, one thread.
-pub(super) const YARDSTICK: EngineSettings = EngineSettings::ort(1);
+/// ONNX Runtime as the baseline: the five exported parts one after another, one thread.
+pub(super) const BASELINE: EngineSettings = EngineSettings::ort(1);
 /// The compiled tick on one thread.
 pub(super) const SINGLE: EngineSettings = EngineSettings::single_threaded(EngineKind::Tract);
 
 /// The engines as they are deployed: tract on one and on two threads, ONNX Runtime on one and on two.
 #[must_use]
 pub fn engines(kinds: &[EngineKind]) -> Vec<Case> {
-    let case = |name, settings| Case { name, settings, rehearses: true };
+    let case = |name, settings| Case { name, settings, warms_caches: true };
     let mut cases = Vec::new();
     for kind in kinds {
         match kind {
@@ -36,7 +36,7 @@ pub fn engines(kinds: &[EngineKind]) -> Vec<Case> {
                 }
             }
             EngineKind::Ort => {
-                cases.push(case("ort", YARDSTICK));
+                cases.push(case("ort", BASELINE));
                 cases.push(case("ort, 2 threads", EngineSettings::ort(2)));
             }
         }
@@ -46,30 +46,30 @@ pub fn engines(kinds: &[EngineKind]) -> Vec<Case> {
 
 /// tract from the exported parts to what is deployed, one step at a time, each with all before it.
 #[must_use]
-pub fn ladder() -> Vec<Case> {
+pub fn ablation() -> Vec<Case> {
     let none = Optimizations::NONE;
     let norms = Optimizations { norms: true, ..none };
     let convolutions = Optimizations { convolutions: true, ..norms };
     let layers = Optimizations { layers: true, ..convolutions };
     let half = Optimizations { half_weights: true, ..layers };
-    let compiled = |name, optimizations, rehearses| Case {
+    let compiled = |name, optimizations, warms_caches| Case {
         name,
         settings: SINGLE.with_form(Form::Compiled(optimizations)),
-        rehearses,
+        warms_caches,
     };
     let mut cases = vec![
-        Case { name: "exported parts", settings: SINGLE.with_form(Form::Exported), rehearses: false },
+        Case { name: "exported parts", settings: SINGLE.with_form(Form::Exported), warms_caches: false },
         compiled("cut, worked ahead", none, false),
         compiled("+ norms fused", norms, false),
         compiled("+ convolutions", convolutions, false),
         compiled("+ layers", layers, false),
-        compiled("+ rehearsed", layers, true),
+        compiled("+ caches warmed", layers, true),
         compiled("+ f16 weights", half, true),
     ];
     if EngineSettings::tract().threads > 1 {
         let two = |name, optimizations| {
             let settings = EngineSettings::tract().with_form(Form::Compiled(optimizations));
-            Case { name, settings, rehearses: true }
+            Case { name, settings, warms_caches: true }
         };
         cases.extend([two("2 threads", layers), two("2 threads, f16 weights", half)]);
     }

@@ -4,14 +4,14 @@ use super::conv_stack::{self, ConvLayer, Direction};
 use super::node::{Backward, fusible, record};
 use super::{conv_up_stack, picture, picture_loss};
 
-/// [`picture_loss`] of what the decoders' stacks paint: `conv_up_stack` of each (input, layers), the robot's first.
+/// [`picture_loss`] of what the decoders' stacks decode: `conv_up_stack` of each (input, layers), the robot's first.
 ///
 /// As one op, because the pictures are by far the largest tensors of an update: nothing of their size, nor of their gradients', passes
 /// through candle. Cost: that of the parts.
 ///
 /// # Errors
 /// Those of candle (shapes, devices).
-pub fn painted_loss(
+pub fn reconstruction_loss(
     stacks: &[(&Tensor, &[ConvLayer<'_>])],
     image: &Tensor,
     mask: Option<&Tensor>,
@@ -41,7 +41,7 @@ struct Kept {
 
 impl Backward for Kept {
     fn name(&self) -> &'static str {
-        "painted-loss"
+        "reconstruction-loss"
     }
 
     fn backward(&self, grads: &[Option<Tensor>], wanted: &[bool]) -> Result<Vec<Option<Tensor>>> {

@@ -7,7 +7,7 @@ const NAMES_SHOWN: usize = 3;
 
 /// When something was made, with what, and on which machine.
 #[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
-pub struct Made {
+pub struct Provenance {
     /// Date and time, UTC.
     pub date: String,
     /// Version of this program.
@@ -22,7 +22,7 @@ pub struct Made {
     pub device: String,
 }
 
-impl Made {
+impl Provenance {
     /// Now and here; `device` as in `--device`.
     #[must_use]
     pub fn now(device: &str) -> Self {
@@ -90,7 +90,7 @@ mod tests {
 
     #[test]
     fn what_is_made_now_has_a_date_and_a_machine() {
-        let made = Made::now("cpu");
+        let made = Provenance::now("cpu");
         assert!(made.date.starts_with("20") && made.date.ends_with(" UTC"), "{made:?}");
         assert!(made.cores > 0 && !made.processor.is_empty());
     }

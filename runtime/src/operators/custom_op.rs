@@ -50,36 +50,36 @@ pub(super) trait Compute: std::fmt::Debug + Send + Sync + 'static {
 
 /// An operator in tract, and with whom it shares its work.
 #[derive(Debug)]
-pub(super) struct Own<C>(Arc<C>, Option<SharedTeam>);
+pub(super) struct CustomOp<C>(Arc<C>, Option<SharedTeam>);
 
-impl<C: Compute> Own<C> {
+impl<C: Compute> CustomOp<C> {
     pub(super) fn boxed(compute: C) -> Box<dyn TypedOp> {
         Box::new(Self(Arc::new(compute), None))
     }
 
     /// Shares with this team what is worth it, if the node is an operator of this kind.
-    pub(super) fn settle(node: &mut TypedNode, team: Option<&SharedTeam>) {
+    pub(super) fn bind_threads(node: &mut TypedNode, team: Option<&SharedTeam>) {
         if let Some(own) = node.op_as_mut::<Self>() {
             own.1 = team.filter(|_| own.0.piece_len().is_some()).cloned();
         }
     }
 }
 
-impl<C> Clone for Own<C> {
+impl<C> Clone for CustomOp<C> {
     fn clone(&self) -> Self {
         Self(Arc::clone(&self.0), self.1.clone())
     }
 }
 
-impl<C> PartialEq for Own<C> {
+impl<C> PartialEq for CustomOp<C> {
     fn eq(&self, other: &Self) -> bool {
         Arc::ptr_eq(&self.0, &other.0)
     }
 }
 
-impl<C> Eq for Own<C> {}
+impl<C> Eq for CustomOp<C> {}
 
-impl<C: Compute> Op for Own<C> {
+impl<C: Compute> Op for CustomOp<C> {
     fn name(&self) -> StaticName {
         C::NAME.into()
     }
@@ -87,7 +87,7 @@ impl<C: Compute> Op for Own<C> {
     op_as_typed_op!();
 }
 
-impl<C: Compute> EvalOp for Own<C> {
+impl<C: Compute> EvalOp for CustomOp<C> {
     not_out_of_plan!();
 
     fn state(&self, _: &EvalContext<'_>) -> TractResult<Option<Box<dyn OpState>>> {
@@ -96,7 +96,7 @@ impl<C: Compute> EvalOp for Own<C> {
     }
 }
 
-impl<C: Compute> TypedOp for Own<C> {
+impl<C: Compute> TypedOp for CustomOp<C> {
     fn output_facts(&self, _: &[&TypedFact]) -> TractResult<TVec<TypedFact>> {
         Ok(tvec!(C::Number::fact(self.0.shape())))
     }
@@ -107,7 +107,7 @@ impl<C: Compute> TypedOp for Own<C> {
 /// The operator with its memory.
 #[derive(Debug)]
 struct OwnState<C: Compute> {
-    op: Own<C>,
+    op: CustomOp<C>,
     /// More than one only where another thread may still read the last.
     scratch: Vec<Arc<C::Scratch>>,
     slot: Option<Arc<WorkerSlot<C>>>,
@@ -115,7 +115,7 @@ struct OwnState<C: Compute> {
 }
 
 impl<C: Compute> OwnState<C> {
-    fn new(op: &Own<C>, results: Results) -> Self {
+    fn new(op: &CustomOp<C>, results: Results) -> Self {
         let scratch = (0..1 + usize::from(op.1.is_some())).map(|_| Arc::new(op.0.scratch())).collect();
         let slot = op.1.is_some().then(|| WorkerSlot::new(&op.0));
         Self { op: op.clone(), scratch, slot, results }
@@ -130,7 +130,7 @@ impl<C: Compute> Clone for OwnState<C> {
 
 impl<C: Compute> OpState for OwnState<C> {
     fn eval(&mut self, _: &EvalContext<'_>, _: &dyn Op, inputs: TVec<TValue>) -> TractResult<TVec<TValue>> {
-        let Self { op: Own(compute, team), scratch, slot, results } = self;
+        let Self { op: CustomOp(compute, team), scratch, slot, results } = self;
         let free = scratch.iter_mut().position(|scratch| Arc::get_mut(scratch).is_some());
         let index = free.unwrap_or_else(|| {
             scratch.push(Arc::new(compute.scratch()));
