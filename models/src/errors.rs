@@ -2,6 +2,12 @@
 
 use std::error::Error;
 
+/// A text of somebody else's on one line.
+#[must_use]
+pub fn on_one_line(text: &str) -> String {
+    text.split_whitespace().collect::<Vec<_>>().join(" ")
+}
+
 /// The error and its causes on one line, without causes that the text before them already tells.
 #[must_use]
 pub fn one_line(error: &(dyn Error + 'static)) -> String {

@@ -52,6 +52,7 @@ pub mod pacing;
 pub mod policy;
 pub mod realtime;
 pub mod record;
+pub mod snapshots;
 pub mod swap;
 pub mod team;
 pub mod telemetry;

@@ -10,7 +10,7 @@ use std::sync::atomic::AtomicBool;
 use std::time::Duration;
 
 use rcwm_runtime::controller::Fallback;
-use rcwm_runtime::telemetry::{SnapshotSettings, Snapshots};
+use rcwm_runtime::snapshots::{SnapshotSettings, Snapshots};
 use rcwm_runtime::{EngineSettings, Policy};
 use serde_json::Value;
 use support::{ask, observation, own_link, smallest_bundle, start_with};

@@ -12,7 +12,7 @@ use rand_chacha::ChaCha8Rng;
 use rcwm_models::settings::{ModelKind, ModelSettings, Preset};
 use rcwm_models::{ACTION_LEN, IMAGE_BYTES, MASK_BYTES};
 use rcwm_trainer::behaviour::{BehaviourLearner, BehaviourSettings, Horizon};
-use rcwm_trainer::cloning::CloningLoss;
+use rcwm_trainer::learning::CloningLoss;
 use rcwm_trainer::learning::{
     Batch, Gradients, HostBatch, Imitation, Side, Trained, WorldLearner, WorldSettings, side_of,
 };

@@ -12,7 +12,8 @@ use crate::controller::{Pace, RunReport, TickObserver};
 use crate::log::{LogError, LogSettings, LogSummary, Logger};
 use crate::policy::Policy;
 use crate::record::{Recorded, Recorder};
-use crate::telemetry::{LatencyFiles, SnapshotSettings, Snapshots, Telemetry};
+use crate::snapshots::{SnapshotSettings, Snapshots};
+use crate::telemetry::{LatencyFiles, Telemetry};
 
 /// What is to be written.
 #[derive(Debug, Args)]

@@ -10,7 +10,6 @@ use tract_onnx::tract_hir::internal::{Factoid, InferenceModelExt};
 
 use super::graph::{Fact, Graph, TickNode};
 use super::{CompileError, inputs};
-use crate::engine::one_line;
 use crate::operators::DOMAIN;
 
 /// Reads the parts, names their values `part/name`, and connects what goes out of one with what goes into another.
@@ -20,7 +19,8 @@ pub(super) fn join(bundle: &Bundle) -> Result<Graph, CompileError> {
         let refuse = |reason: String| CompileError::Part { part, reason };
         let bytes = bundle.part(part).ok_or_else(|| refuse("the bundle does not have it".into()))?;
         let model = onnx::parse_self_contained(bytes).map_err(|error| refuse(error.to_string()))?;
-        let facts = facts(bytes).map_err(|error| refuse(one_line(&format!("{error:#}"))))?;
+        let facts =
+            facts(bytes).map_err(|error| refuse(rcwm_models::errors::on_one_line(&format!("{error:#}"))))?;
         add(&mut graph, part, model, facts);
     }
     for (part, names) in [

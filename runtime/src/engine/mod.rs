@@ -358,16 +358,20 @@ impl TensorContract {
     }
 
     fn load_error(&self, reason: impl std::fmt::Display) -> EngineError {
-        EngineError::Load { engine: self.engine, part: self.part, reason: one_line(&reason.to_string()) }
+        EngineError::Load {
+            engine: self.engine,
+            part: self.part,
+            reason: rcwm_models::errors::on_one_line(&reason.to_string()),
+        }
     }
 
     fn run_error(&self, reason: impl std::fmt::Display) -> EngineError {
-        EngineError::Run { engine: self.engine, part: self.part, reason: one_line(&reason.to_string()) }
+        EngineError::Run {
+            engine: self.engine,
+            part: self.part,
+            reason: rcwm_models::errors::on_one_line(&reason.to_string()),
+        }
     }
-}
-
-pub(crate) fn one_line(text: &str) -> String {
-    text.split_whitespace().collect::<Vec<_>>().join(" ")
 }
 
 #[cfg(test)]

@@ -24,8 +24,10 @@ pub(super) fn environment() -> Result<Environment, EngineError> {
     }
     let path = std::env::var("ORT_DYLIB_PATH").ok().filter(|path| !path.is_empty());
     let path = path.ok_or(EngineError::OrtNotNamed)?;
-    let refuse =
-        |reason: String| EngineError::OrtLibrary { path: path.clone(), reason: super::one_line(&reason) };
+    let refuse = |reason: String| EngineError::OrtLibrary {
+        path: path.clone(),
+        reason: rcwm_models::errors::on_one_line(&reason),
+    };
     if !std::path::Path::new(&path).is_file() {
         return Err(refuse("there is no such file".into()));
     }

@@ -8,14 +8,13 @@ use std::sync::atomic::{AtomicU64, Ordering};
 use std::sync::mpsc::{Receiver, SyncSender, sync_channel};
 use std::thread::JoinHandle;
 
-use rcwm_models::wire::{Action, Observation};
-
 use super::LogError;
 use super::record::{BundleIdentity, Header, Machine};
-use super::worker::Worker;
-use crate::controller::{Fallback, Tick, TickObserver, TickTimes};
+use super::slot::Slot;
+use super::worker::{LogSummary, Worker};
+use crate::controller::{Fallback, Tick, TickObserver};
 use crate::engine::EngineSettings;
-use crate::policy::{CALLS_MAX, Call, Policy, STAGES, Sampling, State};
+use crate::policy::{Policy, STAGES, Sampling};
 
 /// What a log says about its run.
 #[derive(Debug, Clone)]
@@ -49,55 +48,6 @@ impl LogSettings {
             fallback,
             rate_max,
             pool_ticks: Self::POOL_TICKS,
-        }
-    }
-}
-
-/// What was written.
-#[derive(Debug, Clone, PartialEq, Eq, Default, serde::Serialize)]
-pub struct LogSummary {
-    /// The file.
-    pub file: PathBuf,
-    /// Ticks in it.
-    pub ticks: u64,
-    /// Ticks that were dropped because the writer could not keep up.
-    pub dropped: u64,
-    /// Size of the file, in bytes.
-    pub bytes: u64,
-}
-
-/// A tick on its way to the writer. Its buffers are used again and again.
-pub(super) struct Slot {
-    pub(super) observation: Observation,
-    pub(super) observed: bool,
-    pub(super) is_first: bool,
-    pub(super) overtaken: bool,
-    pub(super) times: TickTimes,
-    pub(super) answer: Action,
-    pub(super) calls: Vec<Call>,
-    pub(super) resumes: bool,
-    pub(super) dropped_before: u64,
-    pub(super) state: State,
-    pub(super) noise_position: u128,
-    pub(super) other_bundle: Option<BundleIdentity>,
-}
-
-impl Slot {
-    fn new(policy: &Policy) -> Self {
-        let answer = Action { answers: 0, published_ns: 0, source: 0, reserved: 0, action: [0.0; 4] };
-        Self {
-            observation: Observation::zeroed(),
-            observed: false,
-            is_first: false,
-            overtaken: false,
-            times: TickTimes { scheduled_ns: 0, published_ns: 0, received_ns: 0, sent_ns: 0 },
-            answer,
-            calls: Vec::with_capacity(CALLS_MAX),
-            resumes: false,
-            dropped_before: 0,
-            state: policy.state().clone(),
-            noise_position: 0,
-            other_bundle: None,
         }
     }
 }

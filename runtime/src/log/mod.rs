@@ -22,6 +22,7 @@ mod reader;
 mod record;
 mod replay;
 mod report;
+mod slot;
 #[cfg(test)]
 #[allow(clippy::unwrap_used, reason = "a test that fails panics")]
 mod tests;
@@ -29,13 +30,14 @@ mod worker;
 
 pub use episodes::{WrittenEpisodes, write_episodes};
 pub use latencies::{LoggedLatencies, LoggedLatencyReport};
-pub use logger::{LogSettings, LogSummary, Logger};
+pub use logger::{LogSettings, Logger};
 pub use reader::{Entry, LogReader, LoggedTick};
 pub use record::{
     BundleIdentity, Header, KEYFRAME_TICKS, LoggedCall, LoggedOutcome, Machine, Record, TickRecord,
 };
 pub use replay::Replayer;
 pub use report::{Answers, Difference, ReplayReport};
+pub use worker::LogSummary;
 
 use std::path::PathBuf;
 

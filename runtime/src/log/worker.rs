@@ -11,17 +11,30 @@ use rcwm_models::wire::{Observation, ObservationFlags};
 
 use super::LogError;
 use super::frames::{MAGIC, write_frame, write_start};
-use super::logger::{LogSummary, Slot};
 use super::pack::{ImagePacker, PackedMask};
 use super::record::{
     Header, KEYFRAME_TICKS, LoggedCall, LoggedOutcome, Observed, Record, TickRecord, WholeState, digest,
 };
+use super::slot::Slot;
 use crate::policy::{Call, CallOutcome};
 
 /// What was written reaches the file after so long at the latest.
 const FLUSH: Duration = Duration::from_millis(500);
 /// Niceness of the writing thread: Linux keeps one per thread.
 const NICENESS: i32 = 10;
+
+/// What was written.
+#[derive(Debug, Clone, PartialEq, Eq, Default, serde::Serialize)]
+pub struct LogSummary {
+    /// The file.
+    pub file: PathBuf,
+    /// Ticks in it.
+    pub ticks: u64,
+    /// Ticks that were dropped because the writer could not keep up.
+    pub dropped: u64,
+    /// Size of the file, in bytes.
+    pub bytes: u64,
+}
 
 pub(super) struct Worker {
     path: PathBuf,

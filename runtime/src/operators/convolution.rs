@@ -6,7 +6,8 @@ use tract_onnx::tract_hir::internal::*;
 
 use super::CONV;
 use super::build::{Context, custom_op};
-use super::custom_op::{Compute, CustomOp};
+use super::compute::Compute;
+use super::custom_op::CustomOp;
 use super::memory::slice;
 use super::norm::norm_of;
 use crate::kernels::conv::Conv;

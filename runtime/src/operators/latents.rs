@@ -5,7 +5,8 @@ use tract_onnx::pb::NodeProto;
 use tract_onnx::tract_hir::internal::*;
 
 use super::build::{Context, custom_op};
-use super::custom_op::{Compute, CustomOp};
+use super::compute::Compute;
+use super::custom_op::CustomOp;
 use super::memory::slice;
 use super::{DRAW, LOG_PROBS};
 use crate::kernels::latents;

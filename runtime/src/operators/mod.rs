@@ -4,6 +4,7 @@
 //! Each keeps its results in memory of its own, which is used again as soon as nobody reads them any more: a tick allocates nothing here.
 
 mod build;
+mod compute;
 mod convolution;
 mod custom_op;
 mod latents;

@@ -5,7 +5,7 @@ use std::time::Instant;
 
 use tract_onnx::tract_hir::internal::*;
 
-use super::custom_op::Compute;
+use super::compute::Compute;
 use crate::team::{Job, Pieces, TIMEOUT_MIN, Team, try_lock};
 
 /// What the helper computes for one operator. It writes to memory of its own, from the last piece on: a helper that was stopped half-way

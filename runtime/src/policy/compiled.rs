@@ -148,8 +148,12 @@ impl Compiled {
 
 fn run_error(part: PartName, error: &tract_onnx::prelude::TractError) -> PolicyError {
     let reason = format!("{error:#}");
-    EngineError::Run { engine: crate::EngineKind::Tract, part, reason: crate::engine::one_line(&reason) }
-        .into()
+    EngineError::Run {
+        engine: crate::EngineKind::Tract,
+        part,
+        reason: rcwm_models::errors::on_one_line(&reason),
+    }
+    .into()
 }
 
 impl Tick for Compiled {

@@ -35,7 +35,7 @@ use rcwm_models::bundle::{Bundle, BundleError, Manifest, PartName};
 use rcwm_models::{ACTION_LEN, IMAGE_BYTES};
 
 use crate::compile::CompileError;
-use crate::engine::{EngineError, EngineSettings};
+use crate::engine::{EngineError, EngineSettings, Form};
 use calls::CallRing;
 use noise::NoiseSource;
 use stages::StageClock;
@@ -142,7 +142,7 @@ impl Policy {
         let initial = State::from(&bundle.initial);
         let mut policy = Self {
             limits: ActionLimits::of(&bundle.manifest.control),
-            tick: tick::load(bundle, engine)?,
+            tick: load_tick(bundle, engine)?,
             buffers: Buffers::new(model),
             state: initial.clone(),
             initial,
@@ -411,4 +411,12 @@ impl Policy {
     pub fn limits(&self) -> ActionLimits {
         self.limits
     }
+}
+fn load_tick(bundle: &Bundle, settings: EngineSettings) -> Result<Box<dyn Tick>, PolicyError> {
+    Ok(match settings.form {
+        Form::Exported => Box::new(sequential::Sequential::load(bundle, settings)?),
+        Form::Compiled(optimizations) => {
+            Box::new(compiled::Compiled::load(bundle, optimizations, settings.threads)?)
+        }
+    })
 }

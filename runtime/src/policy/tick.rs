@@ -1,14 +1,10 @@
 //! How a tick is computed: the exported parts one after another, or the compiled tick.
 
 use rcwm_models::ACTION_LEN;
-use rcwm_models::bundle::Bundle;
 
-use super::compiled::Compiled;
 use super::noise::NoiseSource;
-use super::sequential::Sequential;
 use super::stages::StageClock;
 use super::{Buffers, PolicyError, State};
-use crate::engine::{EngineSettings, Form};
 
 /// What a tick works on. What is computed is left in the buffers; the state is the caller's.
 pub(super) struct Work<'a> {
@@ -35,11 +31,4 @@ pub(super) trait Tick: Send {
     /// An image will come soon: what [`Self::observe`] does is done once with what is there, for the sake of the caches. Changes nothing that
     /// is read later.
     fn warm_caches(&mut self) {}
-}
-
-pub(super) fn load(bundle: &Bundle, settings: EngineSettings) -> Result<Box<dyn Tick>, PolicyError> {
-    Ok(match settings.form {
-        Form::Exported => Box::new(Sequential::load(bundle, settings)?),
-        Form::Compiled(optimizations) => Box::new(Compiled::load(bundle, optimizations, settings.threads)?),
-    })
 }

@@ -1,11 +1,10 @@
-//! Latency histograms, one per stage; snapshots of them while a run goes on, files and plots of them at its end.
+//! Latency histograms, one per stage; files and plots of them at the end of a run.
 //!
 //! Times are kept in nanoseconds with three significant digits up to one minute, so that a recording never allocates and never
 //! fails; they are reported in microseconds.
 //!
 //! | file | holds |
 //! | --- | --- |
-//! | `snapshot` | a JSON line every so often: counts, percentiles and surprise of the last interval and in total |
 //! | `hgrm` | HdrHistogram's percentile files, for the usual plotters |
 //! | `plot` | latency by percentile as a picture |
 //! | `files` | the options that ask for them |
@@ -14,12 +13,10 @@ mod files;
 mod hgrm;
 mod plot;
 mod recent;
-mod snapshot;
 
 pub use files::LatencyFiles;
 pub use plot::{Curve, PlotError, plot};
 pub use recent::RECENT_MAX;
-pub use snapshot::{SnapshotError, SnapshotSettings, Snapshots};
 
 use hdrhistogram::Histogram;
 use serde::Serialize;

@@ -4,7 +4,8 @@
 //!
 //! | module | holds |
 //! | --- | --- |
-//! | `program` | commands, buffers and how they share memory |
+//! | `commands`, `kernel` | what a program is made of |
+//! | `program` | a list of commands, and how its buffers share memory |
 //! | `machine` | where programs run: the host, or an NVIDIA GPU |
 //! | `tape` | gradients: every op adds its commands forward and says what to add backward |
 //! | `layers` | the model's layers on a tape |
@@ -15,6 +16,8 @@
 //! Rows of sequences are time-major: row `t * B + b` is step t of sequence b.
 
 pub mod behaviour;
+pub mod commands;
+pub mod kernel;
 pub mod layers;
 pub mod learner;
 pub mod machine;

@@ -4,9 +4,9 @@ use candle_core::Tensor;
 use rcwm_models::settings::ModelSettings;
 use serde::Serialize;
 
-use super::{CloningSettings, cloning_loss};
+use super::CloningSettings;
 use crate::behaviour::{BehaviourLearner, BehaviourSettings, BehaviourUpdate, ReturnRange};
-use crate::learning::{Adam, Gradients, LearningError, Trained};
+use crate::learning::{Adam, Gradients, LearningError, Trained, cloning_loss};
 use crate::model::agent::Agent;
 use crate::model::latent::{Sampler, State};
 use crate::model::parameters::Parameters;

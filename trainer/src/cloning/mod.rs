@@ -10,12 +10,8 @@
 //! | `loss` | how far the actor is from what was demonstrated |
 //! | `learner` | one update of the actor from examples and, if wanted, from imagination |
 
-mod examples;
 mod learner;
-mod loss;
 mod settings;
 
-pub use examples::{Examples, Views, actions_taken, state_of_features};
 pub use learner::{CloningLearner, CloningUpdate};
-pub use loss::{CloningLoss, cloning_loss};
 pub use settings::{CloningSettings, Ramp};

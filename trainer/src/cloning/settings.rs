@@ -1,8 +1,7 @@
 use rcwm_models::settings::SettingsError;
 use serde::{Deserialize, Serialize};
 
-use super::CloningLoss;
-use crate::learning::AdamSettings;
+use crate::learning::{AdamSettings, CloningLoss};
 
 /// A factor that changes evenly from `first` to `last` over a number of updates, and stays there.
 #[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]

@@ -15,6 +15,8 @@
 
 mod adam;
 mod batch;
+mod cloning_loss;
+mod examples;
 mod gradients;
 mod kl;
 mod look;
@@ -27,6 +29,8 @@ mod world;
 
 pub use adam::{Adam, AdamSettings, Moments};
 pub use batch::{Batch, HostBatch};
+pub use cloning_loss::{CloningLoss, cloning_loss};
+pub use examples::{Examples, Views, actions_taken, state_of_features};
 pub use gradients::Gradients;
 pub use kl::{BranchKl, balanced_kl};
 pub use look::{Jitter, Look, LookSettings};

@@ -8,7 +8,7 @@ use super::{
     Adam, Batch, Gradients, LearningError, LossValues, Side, Trained, WorldLosses, WorldSettings, side_of,
     world_losses,
 };
-use crate::cloning::{CloningLoss, Examples, cloning_loss};
+use super::{CloningLoss, Examples, cloning_loss};
 use crate::model::agent::Agent;
 use crate::model::latent::{Sampler, State};
 use crate::model::parameters::Parameters;

@@ -26,6 +26,7 @@
 //! | `heads`, `agent` | reward, continuation, actor, critic; everything together |
 
 pub mod agent;
+mod batch;
 pub mod branch;
 pub mod decoder;
 pub mod encoder;

@@ -3,13 +3,13 @@
 use candle_core::{Result, Tensor};
 use rcwm_models::settings::ModelSettings;
 
+use super::batch::{Decoded, Observed, at_step, normalised_action, sequence};
 use super::branch::Branch;
 use super::decoder::Decoder;
 use super::encoder::{ConvStack, flatten_channels_first, image_to_float};
 use super::interaction::Interaction;
 use super::latent::{FirstSteps, Latent, Sampler, State};
 use super::parameters::{Built, Scope};
-use super::world::{Decoded, Observed, at_step, normalised_action, sequence};
 
 /// Index of the robot in a [`State`].
 pub const ROBOT: usize = 0;

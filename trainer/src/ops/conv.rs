@@ -1,7 +1,8 @@
 use candle_core::{Result, Tensor};
 
 use super::composite;
-use super::conv_stack::{ConvLayer, Direction, stack};
+use super::conv_pass::Direction;
+use super::conv_stack::{ConvLayer, stack};
 use super::node::fusible;
 
 /// Halves the sides of a feature map: `x` [B, H, W, C], `weight` [out, C, 4, 4], gives [B, H/2, W/2, out].

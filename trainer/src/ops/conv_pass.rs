@@ -4,12 +4,20 @@ use std::ops::Range;
 
 use pulp::Arch;
 
-use super::conv_stack::Direction;
 use super::kernels::conv::{
     DoublePanels, Map, double, double_panels, halve, halve_panels, pad, weight_grads,
 };
 use super::kernels::norm::{self, Norm, NormGrads, add, add_rows, add_to_rows};
 use super::kernels::tile::{PANEL, Panels};
+
+/// What a stack does to the sides.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum Direction {
+    /// Convolution: halves them.
+    Down,
+    /// Transposed convolution: doubles them.
+    Up,
+}
 
 /// Weights as the kernel of a direction wants them.
 enum Weights {

@@ -6,7 +6,7 @@ use candle_core::{DType, Device, Result, Tensor};
 use pulp::Arch;
 
 use super::composite;
-use super::conv_pass::{Gradients, Layer, Pass, Scratch};
+use super::conv_pass::{Direction, Gradients, Layer, Pass, Scratch};
 use super::kernels::conv::Map;
 use super::kernels::norm::{Norm, NormGrads};
 use super::kernels::parallel;
@@ -41,15 +41,6 @@ impl<'a> ConvLayer<'a> {
             None => Ok(y),
         }
     }
-}
-
-/// What a stack does to the sides.
-#[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub enum Direction {
-    /// Convolution: halves them.
-    Down,
-    /// Transposed convolution: doubles them.
-    Up,
 }
 
 impl Direction {

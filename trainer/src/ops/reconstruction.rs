@@ -1,6 +1,7 @@
 use candle_core::{DType, Device, Result, Tensor};
 
-use super::conv_stack::{self, ConvLayer, Direction};
+use super::conv_pass::Direction;
+use super::conv_stack::{self, ConvLayer};
 use super::node::{Backward, fusible, record};
 use super::{conv_up_stack, picture, picture_loss};
 

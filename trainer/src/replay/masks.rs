@@ -9,7 +9,7 @@ use rcwm_models::IMAGE_SIDE;
 use rcwm_models::episode::robot_above;
 use rcwm_models::files::open_capped;
 
-use super::load::{LoadError, is, sorted};
+use super::folder::{LoadError, is, sorted};
 
 /// Largest picture of a mask that is read, in bytes.
 const MASK_BYTES_MAX: u64 = 16 << 20;

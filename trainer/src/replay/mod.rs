@@ -11,6 +11,7 @@
 //! masks/reach/000017/00000.png, 00001.png, ...   optional: masks that a segmenter wrote, one a step: white, or the number of an object
 //! ```
 
+mod folder;
 mod held_out;
 mod load;
 mod masks;
@@ -18,7 +19,8 @@ mod prefetch;
 mod shared;
 mod store;
 
-pub use load::{Folder, LoadError};
+pub use folder::LoadError;
+pub use load::Folder;
 pub use prefetch::{Prefetch, PrefetchError};
 pub use shared::SharedReplay;
 pub(crate) use store::check_episode;

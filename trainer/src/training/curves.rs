@@ -6,9 +6,10 @@ use rcwm_models::files::read_capped;
 use serde::Deserialize;
 
 use super::TrainingError;
-use super::run::METRICS_BYTES_MAX;
 use crate::plots::{self, COLOURS, Line, Mark, Panel, Scale};
 
+/// Largest file of metrics that is read back, in bytes.
+pub const METRICS_BYTES_MAX: u64 = 1 << 30;
 /// Pixels of one panel.
 const PANEL: (u32, u32) = (460, 300);
 const COLUMNS: usize = 4;

@@ -14,8 +14,10 @@ use super::{
     TrainingState, start_from,
 };
 use crate::checkpoint::Checkpoint;
-use crate::cloning::{CloningLearner, Examples, Views, cloning_loss, state_of_features};
-use crate::learning::{Imitation, Side, Trained, WorldLearner, side_of};
+use crate::cloning::CloningLearner;
+use crate::learning::{
+    Examples, Imitation, Side, Trained, Views, WorldLearner, cloning_loss, side_of, state_of_features,
+};
 use crate::model::agent::Agent;
 use crate::model::latent::Sampler;
 use crate::model::parameters::Parameters;

@@ -58,6 +58,7 @@ mod weight_average;
 
 pub use averages::{Averages, Interval, Line, TimeBucket};
 pub use compute::Compute;
+pub use curves::METRICS_BYTES_MAX;
 pub use demonstrations::demonstrations;
 pub use evaluations::{EvaluationFacts, EvaluationLine, EvaluationSettings};
 pub use fewshot::{Fewshot, Stage};
@@ -69,7 +70,7 @@ pub use phases::{FewshotSettings, FinetuneSettings, Phase};
 pub use prefill::{Prefilled, episodes_folder, prefill};
 pub use pretrain::{Outcome, Pretraining, Progress};
 pub use reset::{Reset, ResetSettings, start_from};
-pub use run::{Best, METRICS_BYTES_MAX, Run};
+pub use run::{Best, Run};
 pub use settings::{PretrainSettings, ReplaySettings, TrainingSettings};
 pub use state::{StateError, TrainingState};
 

@@ -12,7 +12,7 @@ use serde::{Deserialize, Serialize};
 use super::metrics::scalars;
 use super::tensorboard::EventFile;
 use super::weight_average::WeightAverage;
-use super::{Phase, TrainingError, TrainingSettings, TrainingState, curves};
+use super::{Phase, TrainingError, TrainingSettings, TrainingState, curves, curves::METRICS_BYTES_MAX};
 use crate::checkpoint::{self, Checkpoint, CheckpointSettings};
 use crate::learning::Adam;
 use crate::model::agent;
@@ -21,8 +21,6 @@ use crate::model::parameters::Parameters;
 const SETTINGS_FILE: &str = "settings.toml";
 const METRICS_FILE: &str = "metrics.jsonl";
 const CURVES_FILE: &str = "curves.png";
-/// Largest file of metrics that is read back, in bytes.
-pub const METRICS_BYTES_MAX: u64 = 1 << 30;
 
 /// A run's folder.
 #[derive(Debug)]

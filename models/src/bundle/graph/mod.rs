@@ -6,6 +6,7 @@
 //! is larger than [`Limits`] allows, is refused with the node's name.
 
 mod attributes;
+mod inferred;
 mod movement;
 mod operators;
 mod value;

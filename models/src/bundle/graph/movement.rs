@@ -2,7 +2,7 @@
 
 use super::DType;
 use super::attributes::Attributes;
-use super::operators::{Inferred, take};
+use super::inferred::{Inferred, take};
 use super::value::Value;
 
 /// The numbers of an input that must be known before anything runs.

@@ -1,12 +1,10 @@
 //! Operators that compute: element by element, products, convolutions, reductions.
 
 use super::attributes::Attributes;
+use super::inferred::{Inferred, take};
 use super::value::Value;
 use super::{DType, Limits, movement};
 use crate::onnx::data_type;
-
-/// What a rule gives: the outputs, or what does not fit.
-pub(super) type Inferred = Result<Vec<Value>, String>;
 
 /// The outputs of an operator; none when it is not on the list. `outputs` is how many the node names.
 pub(super) fn infer(
@@ -33,11 +31,6 @@ pub(super) fn infer(
         "Transpose" => movement::transpose(attributes, inputs),
         _ => return None,
     })
-}
-
-/// The inputs, which must be this many.
-pub(super) fn take<'a, const N: usize>(inputs: &[&'a Value]) -> Result<[&'a Value; N], String> {
-    inputs.try_into().map_err(|_| format!("{} inputs, expected {N}", inputs.len()))
 }
 
 fn floats<'a, const N: usize>(inputs: &[&'a Value]) -> Result<[&'a Value; N], String> {

@@ -94,7 +94,7 @@ impl Piece {
         team: Option<&SharedTeam>,
     ) -> Result<Self, PolicyError> {
         Self::try_load(segment, values, team).map_err(|error| {
-            let reason = crate::engine::one_line(&format!("{error:#}"));
+            let reason = rcwm_models::errors::on_one_line(&format!("{error:#}"));
             CompileError::Part { part: segment.part, reason }.into()
         })
     }

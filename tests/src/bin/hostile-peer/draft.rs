@@ -6,8 +6,6 @@ use rand_chacha::ChaCha8Rng;
 use rcwm_models::ACTION_LEN;
 use rcwm_models::wire::{Observation, ObservationFlags};
 
-use crate::world::START_NS;
-
 /// Integers at which programs break.
 const HARD: [u64; 12] = [
     0,
@@ -38,6 +36,8 @@ const HARD_FLOATS: [f32; 12] = [
     1e7,
     -150.0,
 ];
+/// The clock's time at the start, in ns: a machine that has run for hours.
+pub(crate) const START_NS: u64 = 20_000_000_000_000;
 /// A clock that is about to wrap does so after this much of the run, in ns.
 const WRAPS_AFTER_NS: u64 = 2_000_000_000;
 const MINUTE_NS: u64 = 60_000_000_000;

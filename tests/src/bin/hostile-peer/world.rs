@@ -14,13 +14,11 @@ use rcwm_models::wire::{Action, ControllerLink, LinkError, ObservationSample, Wa
 use rcwm_runtime::controller::{Tick, TickObserver, Transport};
 
 use crate::asking::{Asking, Said};
-use crate::draft::Counts;
+use crate::draft::{Counts, START_NS};
 use crate::judge::{Heard, Judge};
 use crate::scenario::{Deed, Setup, Step, When};
 use crate::wire::Wire;
 
-/// The clock's time at the start, in ns: a machine that has run for hours.
-pub(crate) const START_NS: u64 = 20_000_000_000_000;
 /// Waits after the peer's last deed, for what the controller does alone.
 const TAIL_WAITS: u32 = 400;
 /// Looks at clock and link between two deeds after which the loop counts as hung.

@@ -7,11 +7,8 @@ use rcwm_models::bundle::MANIFEST_FILE;
 use rcwm_models::tensors::{Tensors, Values};
 
 use crate::bundle::{Files, Original};
+use crate::graph::HARD_INTEGERS;
 use crate::{bomb, graph};
-
-/// Numbers at which programs break.
-pub(crate) const HARD_INTEGERS: [i64; 14] =
-    [0, 1, -1, 2, 3, 7, 255, 65_536, 1 << 31, (1 << 32) + 1, 1 << 40, 1 << 62, i64::MAX, i64::MIN];
 
 /// A damaged bundle.
 pub(crate) struct Case {

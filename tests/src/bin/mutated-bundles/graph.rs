@@ -6,8 +6,9 @@ use rand::seq::IndexedRandom;
 use rand_chacha::ChaCha8Rng;
 use rcwm_models::onnx::{Attribute, Graph, Model, Node, OperatorSet, Tensor, attribute_type, data_type};
 
-use crate::case::HARD_INTEGERS;
-
+/// Numbers at which programs break.
+pub(crate) const HARD_INTEGERS: [i64; 14] =
+    [0, 1, -1, 2, 3, 7, 255, 65_536, 1 << 31, (1 << 32) + 1, 1 << 40, 1 << 62, i64::MAX, i64::MIN];
 /// Operators that are known to allocate, to index or to loop, beside those of the file itself.
 const OPERATORS: [&str; 22] = [
     "ConstantOfShape",

@@ -4,7 +4,7 @@ use std::sync::{Mutex, PoisonError};
 use std::time::Instant;
 
 use super::{Args, Kernel, PartTime, begin};
-use crate::program::{Command, Finished, Lane, Product};
+use crate::commands::{Command, Finished, Lane, Product};
 
 pub(super) type Function = unsafe extern "C" fn(Args, i32, i32);
 
@@ -115,7 +115,7 @@ static SHARED: Mutex<()> = Mutex::new(());
 
 fn call(kernel: Kernel, args: Args, blocks: usize) {
     let _held = SHARED.lock().unwrap_or_else(PoisonError::into_inner);
-    let function = kernel.on_host();
+    let function = super::on_host(kernel);
     for block in 0..blocks as i32 {
         // SAFETY: the arguments are those that the kernel's description names, and its buffers are as large as its counts say.
         unsafe { function(args, block, blocks as i32) }

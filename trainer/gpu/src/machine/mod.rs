@@ -4,7 +4,9 @@ mod host;
 #[cfg(feature = "cuda")]
 mod nvidia;
 
-use crate::program::{Command, Finished};
+use crate::commands::{Buffer, Command, Finished, Matrix, Pointer};
+pub use crate::kernel::Kernel;
+use crate::kernel::each_kernel;
 
 pub use host::Host;
 #[cfg(feature = "cuda")]
@@ -248,27 +250,11 @@ impl Ready {
     }
 }
 
-macro_rules! kernels {
+macro_rules! host_kernels {
     ($($variant:ident $name:ident),* $(,)?) => {
-        /// A kernel of `kernels/`.
-        #[derive(Debug, Clone, Copy, PartialEq, Eq, Hash)]
-        #[allow(missing_docs, reason = "each is described where it is written, in `kernels/`")]
-        pub enum Kernel { $($variant),* }
-
-        impl Kernel {
-            /// All of them.
-            pub const ALL: &[Self] = &[$(Self::$variant),*];
-
-            /// Its name in the source.
-            #[must_use]
-            pub fn name(self) -> &'static str {
-                match self { $(Self::$variant => stringify!($name)),* }
-            }
-
-            /// Its function on the host.
-            fn on_host(self) -> host::Function {
-                match self { $(Self::$variant => host::functions::$name),* }
-            }
+        /// A kernel's function on the host.
+        fn on_host(kernel: Kernel) -> host::Function {
+            match kernel { $(Kernel::$variant => host::functions::$name),* }
         }
 
         macro_rules! host_functions { () => { $(pub fn $name(a: Args, block: i32, blocks: i32);)* } }
@@ -276,20 +262,7 @@ macro_rules! kernels {
     };
 }
 
-kernels! {
-    NormForward norm_forward, NormBackward norm_backward, NormParameters norm_parameters,
-    ColumnSums column_sums, SumPartials sum_partials, CellForward cell_forward, CellBackward cell_backward,
-    Draw draw, DrawBackward draw_backward, BalancedKl balanced_kl,
-    FillRows fill_rows, CopyRows copy_rows, GatherRows gather_rows, Zero zero, Tanh tanh_of,
-    Carry carry, CarryBackward carry_backward, Transpose transpose, SumOf sum_of, Noise noise,
-    InteractionForward interaction_forward, InteractionBackward interaction_backward,
-    Windows windows, FromWindows from_windows, GatherImages gather_images, PictureLoss picture_loss,
-    TwoHotLoss two_hot_loss, TwoHotMean two_hot_mean, ContinueLoss continue_loss, ScaledSigmoid scaled_sigmoid,
-    ActorDraw actor_draw, ActorBackward actor_backward, LambdaReturns lambda_returns, ActorLoss actor_loss,
-    ReturnRange return_range, Squares squares, Clip clip, Adam adam, Mix mix,
-    NarrowForward narrow_forward, NarrowBackward narrow_backward,
-    ProductFewRows product_few_rows, ProductFewRowsBack product_few_rows_back,
-}
+each_kernel!(host_kernels);
 
 /// Arguments as kernels take them; the same in `kernels/common.h`.
 #[repr(C)]
@@ -301,7 +274,7 @@ pub(in crate::machine) struct Args {
 }
 
 impl Args {
-    fn new(p: &[crate::program::Pointer], n: &[i32], f: &[f32]) -> Self {
+    fn new(p: &[Pointer], n: &[i32], f: &[f32]) -> Self {
         let mut args = Self::default();
         for (to, from) in args.p.iter_mut().zip(p) {
             *to = from.place.map_or(0, |place| address(place) + from.bytes as u64);
@@ -313,14 +286,14 @@ impl Args {
 }
 
 /// The address of a place in a finished program.
-fn address(place: crate::program::Buffer) -> u64 {
+fn address(place: Buffer) -> u64 {
     match place {
-        crate::program::Buffer::Fixed(address) => address,
-        crate::program::Buffer::Transient(_) => unreachable!("a finished program has fixed places alone"),
+        Buffer::Fixed(address) => address,
+        Buffer::Transient(_) => unreachable!("a finished program has fixed places alone"),
     }
 }
 
 /// The address of a matrix's first number.
-fn begin(matrix: crate::program::Matrix) -> u64 {
+fn begin(matrix: Matrix) -> u64 {
     address(matrix.place) + 4 * matrix.offset as u64
 }

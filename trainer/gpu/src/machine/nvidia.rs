@@ -14,7 +14,7 @@ use cudarc::nvrtc::{CompileOptions, Ptx, compile_ptx_with_opts};
 
 use super::host::flops;
 use super::{Args, CommandTime, GpuError, Kernel, PartTime, Precision, begin};
-use crate::program::{Command, Finished, Lane, Product};
+use crate::commands::{Command, Finished, Lane, Product};
 
 // SAFETY: plain numbers in C's layout, the same on host and device.
 unsafe impl DeviceRepr for Args {}

@@ -10,6 +10,7 @@ pub mod gates;
 pub mod gemm;
 pub mod math;
 pub mod norm;
+mod norm_parameters;
 pub mod norm_vector;
 pub mod parallel;
 pub mod picture;

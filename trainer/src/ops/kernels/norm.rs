@@ -1,6 +1,7 @@
 //! LayerNorm over rows, with or without `SiLU` after it.
 
 use super::math::{silu, silu_slope};
+pub use super::norm_parameters::{Norm, NormGrads, add};
 use super::{norm_vector, vectorised};
 
 /// Calls `$body` with the widest `N` of 16, 8, 4, 1 that divides `$width`: chunks of `N` then make up a row.
@@ -14,53 +15,6 @@ macro_rules! with_lanes {
             _ => $body::<1>($($argument),*),
         }
     };
-}
-
-/// What a normalisation is made of.
-#[derive(Debug, Clone, Copy)]
-pub struct Norm<'a> {
-    /// Factor of each column, [width].
-    pub gain: &'a [f32],
-    /// Shift of each column, [width].
-    pub shift: &'a [f32],
-    /// Added to the variance.
-    pub eps: f32,
-    /// Whether `SiLU` follows.
-    pub silu: bool,
-}
-
-/// Gradients of gain and shift, summed over rows.
-#[derive(Debug, Clone)]
-pub struct NormGrads {
-    /// Of the gain, [width].
-    pub gain: Vec<f32>,
-    /// Of the shift, [width].
-    pub shift: Vec<f32>,
-}
-
-impl NormGrads {
-    /// Zeros.
-    pub fn new(width: usize) -> Self {
-        Self { gain: vec![0.0; width], shift: vec![0.0; width] }
-    }
-
-    /// Adds another sum.
-    pub fn add(&mut self, other: &Self) {
-        add(&mut self.gain, &other.gain);
-        add(&mut self.shift, &other.shift);
-    }
-}
-
-/// `sum += terms`.
-pub fn add(sum: &mut [f32], terms: &[f32]) {
-    vectorised(
-        #[inline(always)]
-        || {
-            for (sum, term) in sum.iter_mut().zip(terms) {
-                *sum += term;
-            }
-        },
-    );
 }
 
 /// Adds `terms` [width] to every row.

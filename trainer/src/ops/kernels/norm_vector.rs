@@ -6,7 +6,7 @@
 use pulp::{Arch, Simd, WithSimd};
 
 use super::math::{LN_2_HIGH, LN_2_LOW, ROUND};
-use super::norm::{Norm, NormGrads};
+use super::norm_parameters::{Norm, NormGrads};
 
 /// The polynomial of [`math::exp`](super::math::exp): 1/8! to 1/2!, then 1, 1.
 const EXP: [f32; 9] =

@@ -15,9 +15,9 @@ use std::time::{Duration, Instant, SystemTime};
 use hdrhistogram::Histogram;
 use serde::Serialize;
 
-use super::{Latency, Stage, Telemetry};
 use crate::controller::{Counters, Tick, TickObserver};
 use crate::policy::{CallOutcome, Policy, Surprise};
+use crate::telemetry::{Latency, Stage, Telemetry};
 
 /// Ticks that may wait to be taken up: one second at 4 kHz.
 const QUEUE_TICKS: usize = 4096;

@@ -7,7 +7,7 @@ use rcwm_models::episode::Episode;
 use rcwm_models::settings::{ModelKind, ModelSettings};
 use rcwm_models::{ACTION_LEN, IMAGE_CHANNELS, IMAGE_SIDE};
 
-use crate::learning::{Batch, Shift};
+use super::{Batch, Shift};
 use crate::model::agent::Agent;
 use crate::model::latent::{FirstSteps, Latent, Sampler, State};
 
