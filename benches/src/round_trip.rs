@@ -110,14 +110,23 @@ fn histogram() -> Result<Histogram<u64>, Failure> {
 
 fn report(times: &[Histogram<u64>; 3], json: Option<&str>) -> Result<(), Failure> {
     let names = ["link, polling", "link, blocking", "pipe pair (baseline)"];
-    println!("{:<22} {:>9} {:>9} {:>9} {:>9}  p50 ratio", "round trip, us", "p50", "p99", "p99.9", "max");
+    rcwm_models::outln!(
+        "{:<22} {:>9} {:>9} {:>9} {:>9}  p50 ratio",
+        "round trip, us",
+        "p50",
+        "p99",
+        "p99.9",
+        "max"
+    );
     let baseline_ns = times[2].value_at_quantile(0.5) as f64;
     let mut rows = Vec::new();
     for (name, times) in names.iter().zip(times) {
         let us = |quantile: f64| times.value_at_quantile(quantile) as f64 / 1e3;
         let (p50_us, p99_us, p999_us, max_us) = (us(0.5), us(0.99), us(0.999), times.max() as f64 / 1e3);
         let ratio = times.value_at_quantile(0.5) as f64 / baseline_ns;
-        println!("{name:<22} {p50_us:>9.2} {p99_us:>9.2} {p999_us:>9.2} {max_us:>9.2}  {ratio:.3}");
+        rcwm_models::outln!(
+            "{name:<22} {p50_us:>9.2} {p99_us:>9.2} {p999_us:>9.2} {max_us:>9.2}  {ratio:.3}"
+        );
         rows.push(serde_json::json!({
             "name": name, "rounds": times.len(), "p50_us": p50_us, "p99_us": p99_us, "p999_us": p999_us,
             "max_us": max_us, "ratio_p50_vs_pipe": ratio,

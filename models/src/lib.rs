@@ -13,6 +13,7 @@
 //! | [`files`] | atomic writes, checksums, capped reads |
 //! | [`help`] | the examples of a help text |
 //! | [`lock`] | one writer a folder |
+//! | [`progress`] | how far a long work is, on a terminal or by lines |
 //! | [`terminal`] | printing that survives a closed pipe and a full disk; lines of progress without a terminal |
 //!
 //! This crate never depends on candle, tract or pyo3.
@@ -24,6 +25,7 @@ pub mod files;
 pub mod help;
 pub mod lock;
 pub mod onnx;
+pub mod progress;
 pub mod settings;
 pub mod tasks;
 pub mod tensors;

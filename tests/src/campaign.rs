@@ -7,6 +7,7 @@ use std::sync::atomic::{AtomicBool, Ordering};
 
 use anyhow::Context;
 use indicatif::{ProgressBar, ProgressStyle};
+use rcwm_models::progress::Bar;
 use serde::Serialize;
 
 /// 0 without a finding; an error is told in one line.
@@ -33,13 +34,13 @@ pub fn stop_on_ctrl_c() -> anyhow::Result<Arc<AtomicBool>> {
     Ok(stop)
 }
 
-/// A bar of so much work.
+/// A bar of so much work, whose parts are called `unit`.
 ///
 /// # Errors
 /// Where `style` is no template.
-pub fn bar(length: u64, style: &str) -> anyhow::Result<ProgressBar> {
+pub fn bar(length: u64, style: &str, unit: &'static str) -> anyhow::Result<Bar> {
     let style = ProgressStyle::with_template(style).context("the bar's template")?;
-    Ok(ProgressBar::new(length).with_style(style))
+    Ok(Bar::new(ProgressBar::new(length).with_style(style), "", unit))
 }
 
 /// Does the same on so many threads until each has ended.

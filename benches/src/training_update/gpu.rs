@@ -249,7 +249,7 @@ fn make(case: &Case, ordinal: usize, precision: Precision, seed: u64) -> Result<
 impl GpuReport {
     /// The table.
     pub fn print(&self) {
-        println!(
+        rcwm_models::outln!(
             "{} on {}, {}: batch {} x {}, imagination {}; {} learners; {} updates; prepared in {:.0} ms; memory {:.0} MB",
             self.name,
             self.card,
@@ -262,7 +262,7 @@ impl GpuReport {
             self.prepare_ms,
             self.memory_mbyte,
         );
-        println!(
+        rcwm_models::outln!(
             "  replayed: world model {:.2} ms (90 %: {:.2}), {} commands; behaviour {:.2} ms (90 %: {:.2}), {} commands; \
              {:.1} updates of the world model a second",
             self.world_median_ms,
@@ -273,22 +273,37 @@ impl GpuReport {
             self.behaviour_commands,
             self.world_updates_per_s,
         );
-        println!(
+        rcwm_models::outln!(
             "  {:10} {:10} {:>9} {:>9} {:>10} {:>9}",
-            "program", "part", "commands", "ms", "GFLOP", "TFLOP/s"
+            "program",
+            "part",
+            "commands",
+            "ms",
+            "GFLOP",
+            "TFLOP/s"
         );
         for part in &self.parts {
-            println!(
+            rcwm_models::outln!(
                 "  {:10} {:10} {:>9} {:>9.2} {:>10.2} {:>9.2}",
-                part.program, part.part, part.commands, part.ms, part.gflop, part.tflops_per_s
+                part.program,
+                part.part,
+                part.commands,
+                part.ms,
+                part.gflop,
+                part.tflops_per_s
             );
         }
         for row in &self.dearest {
-            println!(
+            rcwm_models::outln!(
                 "  {:10} {:10} {:40} {:>6} x {:>9.2} us = {:>7.2} ms",
-                row.program, row.part, row.name, row.count, row.us, row.all_ms
+                row.program,
+                row.part,
+                row.name,
+                row.count,
+                row.us,
+                row.all_ms
             );
         }
-        println!();
+        rcwm_models::outln!();
     }
 }

@@ -109,7 +109,7 @@ fn main() -> ExitCode {
     match run(&Arguments::parse()) {
         Ok(()) => ExitCode::SUCCESS,
         Err(error) => {
-            eprintln!("training-update: {}", one_line(error.as_ref()));
+            rcwm_models::errln!("training-update: {}", one_line(error.as_ref()));
             ExitCode::FAILURE
         }
     }

@@ -77,7 +77,7 @@ impl Report {
 
     /// The table of parts.
     pub fn print(&self) {
-        println!(
+        rcwm_models::outln!(
             "{}: batch {} x {}, imagination {}, {:.1} M parameters; {} updates; gemm peak {:.0} GFLOP/s; memory {:.0} MB; load {}",
             self.name,
             self.batch,
@@ -89,19 +89,28 @@ impl Report {
             self.memory_peak_mbyte,
             self.load.map_or("unknown".to_owned(), |load| format!("{load:.1}")),
         );
-        println!(
+        rcwm_models::outln!(
             "  {:16} {:>9} {:>9} {:>9} {:>9} {:>8} {:>9} {:>6} {:>8} {:>6}",
-            "part", "median ms", "least", "90 %", "most", "GFLOP", "GFLOP/s", "peak", "MB", "GB/s"
+            "part",
+            "median ms",
+            "least",
+            "90 %",
+            "most",
+            "GFLOP",
+            "GFLOP/s",
+            "peak",
+            "MB",
+            "GB/s"
         );
         for row in self.parts.iter().chain([&self.world, &self.behaviour]) {
             row.print();
         }
-        println!();
+        rcwm_models::outln!();
     }
 
     /// One line of the growth table.
     pub fn print_line(&self) {
-        println!(
+        rcwm_models::outln!(
             "  {:12} {:>9.1} {:>9.1} {:>9.1} {:>9.1} {:>10.2} {:>10.2} {:>9.0}",
             self.name,
             self.world.median_ms,
@@ -116,10 +125,17 @@ impl Report {
 
     /// Its heading.
     pub fn print_heading() {
-        println!("growth of the small update, one size changed at a time");
-        println!(
+        rcwm_models::outln!("growth of the small update, one size changed at a time");
+        rcwm_models::outln!(
             "  {:12} {:>9} {:>9} {:>9} {:>9} {:>10} {:>10} {:>9}",
-            "changed", "world ms", "least", "behav. ms", "least", "w. GFLOP", "b. GFLOP", "memory MB"
+            "changed",
+            "world ms",
+            "least",
+            "behav. ms",
+            "least",
+            "w. GFLOP",
+            "b. GFLOP",
+            "memory MB"
         );
     }
 }
@@ -147,7 +163,7 @@ impl Row {
     }
 
     fn print(&self) {
-        println!(
+        rcwm_models::outln!(
             "  {:16} {:>9.2} {:>9.2} {:>9.2} {:>9.2} {:>8.2} {:>9.1} {:>5.0}% {:>8.1} {:>6.1}",
             self.part,
             self.median_ms,

@@ -33,7 +33,7 @@ use clap::{Parser, Subcommand, ValueEnum};
 use rcwm_models::bundle::Bundle;
 use rcwm_models::errors::one_line;
 use rcwm_models::files::{Output, prepare_output, write_output};
-use rcwm_models::terminal::Heartbeat;
+use rcwm_models::progress::Bar;
 use serde::Serialize;
 
 use crate::controller::ControllerError;
@@ -240,29 +240,10 @@ fn stop_flag_after(last: impl Fn() + Clone + Send + 'static) -> anyhow::Result<A
     Ok(stop)
 }
 
-/// A bar; where no terminal shows it, a line every so often says how far the work is.
-struct Bar {
-    bar: indicatif::ProgressBar,
-    _lines: Option<Heartbeat>,
-}
-
-impl std::ops::Deref for Bar {
-    type Target = indicatif::ProgressBar;
-    fn deref(&self) -> &Self::Target {
-        &self.bar
-    }
-}
-
 fn progress_bar(len: usize, what: &'static str, unit: &'static str) -> Bar {
-    let style = indicatif::ProgressStyle::with_template("{msg} {wide_bar} {pos}/{len} {elapsed}")
+    let style = indicatif::ProgressStyle::with_template("{prefix} {wide_bar} {pos}/{len} {elapsed}")
         .unwrap_or_else(|_| indicatif::ProgressStyle::default_bar());
-    let bar = indicatif::ProgressBar::new(len as u64).with_style(style).with_message(what);
-    let lines = bar.is_hidden().then(|| {
-        let bar = bar.clone();
-        let length = |bar: &indicatif::ProgressBar| bar.length().filter(|all| *all > 0);
-        Heartbeat::of_work(what, unit, move || (bar.position(), length(&bar), String::new()))
-    });
-    Bar { bar, _lines: lines }
+    Bar::new(indicatif::ProgressBar::new(len as u64).with_style(style).with_prefix(what), what, unit)
 }
 
 #[cfg(test)]

@@ -66,11 +66,11 @@ fn main() -> anyhow::Result<()> {
         anyhow::bail!("--only {}: no such fault; there are {names}", arguments.only.join(" --only "));
     }
     let bar = indicatif::ProgressBar::new(experiments.len() as u64);
-    println!("{HEADER}");
+    rcwm_models::outln!("{HEADER}");
     let mut outcomes = Vec::new();
     for experiment in experiments {
         let outcome = experiment.run(arguments.rounds, period);
-        bar.suspend(|| println!("{}", row(&outcome)));
+        bar.suspend(|| rcwm_models::outln!("{}", row(&outcome)));
         bar.inc(1);
         outcomes.push(outcome);
     }

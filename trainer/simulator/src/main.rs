@@ -13,8 +13,8 @@ use clap::Parser;
 use indicatif::{ProgressBar, ProgressStyle};
 use rcwm_models::errors::one_line;
 use rcwm_models::files::{Output, prepare_output, write_output};
+use rcwm_models::progress::Bar;
 use rcwm_models::tasks::{DOWNSTREAM, TASKS, UPSTREAM, task_id};
-use rcwm_models::terminal::Heartbeat;
 use rcwm_models::wire::{LinkSettings, SimulatorLink};
 use rcwm_simulator::environment::Environment;
 use rcwm_simulator::serve::{ServeSettings, serve};
@@ -57,12 +57,7 @@ fn run_serve(arguments: &ServeArguments) -> Result<()> {
     rcwm_models::errln!("serving {} on instance {:?}; Ctrl-C ends", arguments.task, arguments.instance);
 
     let settings = arguments.serve();
-    let bar = episodes_bar(&settings);
-    let _lines = bar.is_hidden().then(|| {
-        let bar = bar.clone();
-        let length = |bar: &ProgressBar| bar.length().filter(|all| *all > 0);
-        Heartbeat::of_work("serving", "steps", move || (bar.position(), length(&bar), bar.message()))
-    });
+    let bar = Bar::new(episodes_bar(&settings), "serving", "steps");
     let tally = serve(&environment, link, &settings, &stop, |episode, step| {
         bar.set_position(
             (episode - settings.first_episode) * u64::from(settings.steps_max) + u64::from(step),

@@ -1,51 +1,16 @@
 //! What the verbs that learn a task have in common.
 
-use std::ops::Deref;
 use std::path::{Path, PathBuf};
 
 use anyhow::{Context, Result, bail};
 use indicatif::{ProgressBar, ProgressStyle};
 use rcwm_models::settings::{self, Preset};
-use rcwm_models::terminal::Heartbeat;
 use rcwm_trainer::checkpoint::Checkpoint;
 use rcwm_trainer::training::{Phase, TrainingSettings};
 
+pub use rcwm_models::progress::{Bar, say};
+
 use super::PresetName;
-
-/// A bar; where no terminal shows it, a line every so often says how far the work is.
-pub struct Bar {
-    bar: ProgressBar,
-    _lines: Option<Heartbeat>,
-}
-
-impl Bar {
-    /// Of a work that is called `what`, whose parts are called `unit`.
-    pub fn new(bar: ProgressBar, what: &'static str, unit: &'static str) -> Self {
-        let lines = bar.is_hidden().then(|| {
-            let bar = bar.clone();
-            let length = |bar: &ProgressBar| bar.length().filter(|all| *all > 0);
-            Heartbeat::of_work(what, unit, move || (bar.position(), length(&bar), bar.message()))
-        });
-        Self { bar, _lines: lines }
-    }
-
-    /// A line above the bar, or on its own.
-    pub fn say(&self, line: &str) {
-        say(&self.bar, line);
-    }
-}
-
-/// A line above a bar, or on its own where no terminal shows the bar.
-pub fn say(bar: &ProgressBar, line: &str) {
-    if bar.is_hidden() { rcwm_models::errln!("{line}") } else { bar.println(line) }
-}
-
-impl Deref for Bar {
-    type Target = ProgressBar;
-    fn deref(&self) -> &ProgressBar {
-        &self.bar
-    }
-}
 
 /// Settings with those that `--set` changes. What the phase has no use for is refused, and so is what an option of its own says.
 pub fn changed(settings: &TrainingSettings, overrides: &[String]) -> Result<TrainingSettings> {

@@ -170,7 +170,8 @@ fn run_seeds(arguments: &Arguments) -> anyhow::Result<bool> {
     let stop = campaign::stop_on_ctrl_c()?;
     run::keep_panics();
     let bundles = Bundles::make(&arguments.bundle)?;
-    let bar = campaign::bar(arguments.messages, "{wide_bar} {pos}/{len} messages {elapsed} eta {eta}")?;
+    let bar =
+        campaign::bar(arguments.messages, "{wide_bar} {pos}/{len} messages {elapsed} eta {eta}", "messages")?;
     let shared = Mutex::new(Report::new(arguments));
     let work = || -> anyhow::Result<()> {
         let domain = Domain::new();

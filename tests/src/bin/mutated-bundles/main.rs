@@ -78,7 +78,7 @@ fn main() -> ExitCode {
 /// Hands out seeds to children; true without a finding.
 fn supervise(arguments: &Arguments) -> anyhow::Result<bool> {
     let stop = campaign::stop_on_ctrl_c()?;
-    let bar = campaign::bar(arguments.count, "{msg} {wide_bar} {pos}/{len} {elapsed} eta {eta}")?;
+    let bar = campaign::bar(arguments.count, "{msg} {wide_bar} {pos}/{len} {elapsed} eta {eta}", "bundles")?;
     let shared = Mutex::new(Report::new(arguments));
     let work = || -> anyhow::Result<()> {
         let mut child = Child::start(arguments)?;
@@ -87,7 +87,7 @@ fn supervise(arguments: &Arguments) -> anyhow::Result<bool> {
             let Some(seed) = taken.filter(|_| !stop.load(Ordering::Relaxed)) else { return Ok(()) };
             let ended = child.work_on(seed, arguments)?;
             if let Some(line) = shared.lock().unwrap_or_else(PoisonError::into_inner).note(seed, &ended) {
-                bar.suspend(|| println!("{line}"));
+                bar.suspend(|| rcwm_models::outln!("{line}"));
             }
             bar.inc(1);
         }
@@ -95,7 +95,7 @@ fn supervise(arguments: &Arguments) -> anyhow::Result<bool> {
     campaign::on_threads(arguments.workers.into(), work)?;
     bar.finish_and_clear();
     let report = shared.into_inner().unwrap_or_else(PoisonError::into_inner);
-    print!("{}", report.text());
+    rcwm_models::out!("{}", report.text());
     campaign::write_json(arguments.json.as_deref(), &report)?;
     Ok(report.findings.is_empty())
 }

@@ -128,7 +128,7 @@ fn run(arguments: &Arguments) -> anyhow::Result<bool> {
     report.finish(&std::fs::read(&summary).context("the run's summary")?)?;
     report.leftovers = list_leftovers(&prefix)?;
     forget_prefix(&prefix);
-    print!("{}", report.text());
+    rcwm_models::out!("{}", report.text());
     campaign::write_json(arguments.json.as_deref(), &report)?;
     Ok(report.passes())
 }
@@ -201,7 +201,7 @@ impl Clock<'_> {
             }
             if elapsed >= next_report {
                 let report = self.report();
-                println!("{}", report.line(elapsed));
+                rcwm_models::outln!("{}", report.line(elapsed));
                 campaign::write_json(self.arguments.json.as_deref(), &*report)?;
                 next_report += REPORT;
             }

@@ -121,7 +121,7 @@ fn run(arguments: &Arguments) -> anyhow::Result<bool> {
     let leftovers = list_leftovers(&prefix)?;
     forget_prefix(&prefix);
     let report = Report { rate_hz: arguments.rate_hz, phases, swaps, run, leftovers };
-    print!("{}", report.text());
+    rcwm_models::out!("{}", report.text());
     campaign::write_json(arguments.json.as_deref(), &report)?;
     Ok(report.swaps.wrong.is_empty() && report.swaps.taken == arguments.swaps)
 }
