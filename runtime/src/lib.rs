@@ -45,7 +45,6 @@ pub mod compile;
 pub mod controller;
 pub mod engine;
 pub mod inspect;
-pub mod kernels;
 pub mod log;
 pub mod operators;
 pub mod pacing;
@@ -54,7 +53,6 @@ pub mod realtime;
 pub mod record;
 pub mod snapshots;
 pub mod swap;
-pub mod team;
 pub mod telemetry;
 pub mod verify;
 

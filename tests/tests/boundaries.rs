@@ -42,6 +42,15 @@ fn the_contract_depends_on_no_engine_and_no_python() {
 }
 
 #[test]
+fn the_kernels_depend_on_no_engine_and_no_python() {
+    let dependencies = normal_dependencies("rcwm-kernels");
+    for name in [CANDLE, TRACT, PYTHON].concat() {
+        assert!(!dependencies.iter().any(|found| found == name), "rcwm-kernels depends on {name}");
+    }
+    assert!(dependencies.iter().any(|name| name == "pulp"), "rcwm-kernels was looked at");
+}
+
+#[test]
 fn the_runtime_depends_on_neither_candle_nor_python() {
     assert_without("rcwm-runtime", &[CANDLE, PYTHON]);
 }

@@ -14,6 +14,7 @@ use syn::visit::{Visit, visit_item_mod, visit_path};
 const CRATES: &[&str] = &[
     "models/src",
     "runtime/src",
+    "runtime/kernels/src",
     "trainer/src",
     "trainer/gpu/src",
     "trainer/simulator/src",

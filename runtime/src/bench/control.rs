@@ -9,8 +9,8 @@ use std::time::{Duration, Instant};
 use serde::Serialize;
 
 use super::BenchError;
-use crate::team::{Job, Pieces, Team};
 use crate::telemetry::{Stage, Telemetry};
+use rcwm_kernels::team::{Job, Pieces, Team};
 
 /// Numbers that are worked on side by side: they fit into the registers of any x86, and keep its units for arithmetic busy, so that a
 /// core that has to be shared shows.

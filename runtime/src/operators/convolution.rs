@@ -10,8 +10,8 @@ use super::compute::Compute;
 use super::custom_op::CustomOp;
 use super::memory::slice;
 use super::norm::norm_of;
-use crate::kernels::conv::Conv;
-use crate::kernels::norm::Norm;
+use rcwm_kernels::tick::conv::Conv;
+use rcwm_kernels::tick::norm::Norm;
 
 /// Work below this is not worth sharing: the pixels would have to go from one core to the other and back.
 const SHARED_FLOPS_MIN: usize = 2_000_000;

@@ -9,7 +9,7 @@ use super::compute::Compute;
 use super::custom_op::CustomOp;
 use super::memory::slice;
 use super::{DRAW, LOG_PROBS};
-use crate::kernels::latents;
+use rcwm_kernels::tick::latents;
 
 pub(super) fn build_log_probs(
     _: &Context<'_>,

@@ -10,10 +10,10 @@ use super::custom_op::CustomOp;
 use super::memory::slice;
 use super::norm::norm_of;
 use super::{LAYER, Term};
-use crate::kernels::matrix::Matrix;
-use crate::kernels::norm::Norm;
-use crate::kernels::table::Table;
-use crate::kernels::weights::Precision;
+use rcwm_kernels::tick::matrix::Matrix;
+use rcwm_kernels::tick::norm::Norm;
+use rcwm_kernels::tick::table::Table;
+use rcwm_kernels::tick::weights::Precision;
 
 /// Weights below this are not worth sharing.
 const SHARED_WEIGHTS_MIN: usize = 1 << 16;

@@ -1,5 +1,5 @@
 //! Operators of our own that tract runs in place of groups of standard ones. They stand in the graphs that [`crate::compile`] writes, in a
-//! domain of their own; what they compute is in [`crate::kernels`].
+//! domain of their own; what they compute is in [`rcwm_kernels::tick`].
 //!
 //! Each keeps its results in memory of its own, which is used again as soon as nobody reads them any more: a tick allocates nothing here.
 
@@ -17,8 +17,8 @@ use std::sync::Arc;
 
 use tract_onnx::prelude::TypedModel;
 
-use crate::team::Team;
 use custom_op::CustomOp;
+use rcwm_kernels::team::Team;
 
 /// Domain of the operators.
 pub const DOMAIN: &str = "rcwm";

@@ -9,7 +9,7 @@ use super::build::{Context, OpContext, custom_op};
 use super::compute::Compute;
 use super::custom_op::CustomOp;
 use super::memory::slice;
-use crate::kernels::norm::Norm;
+use rcwm_kernels::tick::norm::Norm;
 
 pub(super) fn build(_: &Context<'_>, node: &NodeProto) -> TractResult<(Box<dyn InferenceOp>, Vec<String>)> {
     custom_op(node, f32::datum_type(), |context| {

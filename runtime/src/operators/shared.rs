@@ -6,7 +6,7 @@ use std::time::Instant;
 use tract_onnx::tract_hir::internal::*;
 
 use super::compute::Compute;
-use crate::team::{Job, Pieces, TIMEOUT_MIN, Team, try_lock};
+use rcwm_kernels::team::{Job, Pieces, TIMEOUT_MIN, Team, try_lock};
 
 /// What the helper computes for one operator. It writes to memory of its own, from the last piece on: a helper that was stopped half-way
 /// and goes on much later touches nothing that anybody else reads or has given to the next tick.
@@ -127,7 +127,7 @@ impl<C: Compute> WorkerSlot<C> {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::team::HELPER_NAME;
+    use rcwm_kernels::team::HELPER_NAME;
     use std::sync::atomic::{AtomicBool, Ordering};
     use std::time::Duration;
 

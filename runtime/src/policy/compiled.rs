@@ -20,9 +20,9 @@ use super::{Buffers, PolicyError};
 use crate::compile::{CompileError, Optimizations, compile, inputs};
 use crate::engine::{EngineError, weights};
 use crate::operators::SharedTeam;
-use crate::team::Team;
 use branches::Branches;
 use pieces::{Piece, Values};
+use rcwm_kernels::team::Team;
 
 /// How long the helper looks for work after the last before it sleeps.
 const HELPER_SPINS: Duration = Duration::from_micros(200);

@@ -7,7 +7,7 @@ use rcwm_models::settings::ModelSettings;
 
 use super::{BranchState, PolicyError, Surprise};
 use crate::engine::{self, EngineError, EngineSettings, Input, Output, Part};
-use crate::kernels::latents;
+use rcwm_kernels::tick::latents;
 
 /// What a branch computes in a tick.
 #[derive(Debug, Clone, Default)]

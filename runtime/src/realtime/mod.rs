@@ -9,7 +9,7 @@ use rustix::process::Pid;
 use rustix::thread::{CpuSet, sched_getaffinity, sched_setaffinity};
 use serde::Serialize;
 
-use crate::team::HELPER_NAME;
+use rcwm_kernels::team::HELPER_NAME;
 
 /// What to ask for.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]

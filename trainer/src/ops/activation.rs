@@ -3,10 +3,10 @@ use std::ops::Range;
 use candle_core::{Result, Tensor};
 
 use super::composite;
-use super::kernels::categorical::{self, Output};
-use super::kernels::{math, vectorised};
 use super::node::fusible;
 use super::rows::{self, RowOp};
+use rcwm_kernels::batch::categorical::{self, Output};
+use rcwm_kernels::{batch::math, vectorised};
 
 /// `1 / (1 + exp(-x))`: no overflow and no NaN gradient for any x.
 ///

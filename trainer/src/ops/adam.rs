@@ -4,8 +4,9 @@ use std::sync::Mutex;
 
 use candle_core::{CpuStorage, InplaceOp1, Layout, Result, Tensor, Var};
 
-use super::kernels::{parallel, vectorised};
 use super::node::{floats, fusible, mismatch};
+use super::parallel;
+use rcwm_kernels::vectorised;
 
 /// One step as in PyTorch: bias correction, epsilon outside the square root.
 #[derive(Debug, Clone, Copy, PartialEq)]
@@ -61,7 +62,7 @@ fn squares(grad: &[f32]) -> f64 {
         || {
             let mut total = 0.0;
             for run in grad.chunks(2048) {
-                total += f64::from(super::kernels::math::sum_of(
+                total += f64::from(rcwm_kernels::batch::math::sum_of(
                     run,
                     #[inline(always)]
                     |x| x * x,

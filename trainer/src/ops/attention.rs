@@ -1,8 +1,8 @@
 use candle_core::{Result, Tensor};
 
 use super::composite;
-use super::kernels::attention::{self, Sizes};
 use super::node::{Backward, floats, fusible, mismatch, record};
+use rcwm_kernels::batch::attention::{self, Sizes};
 
 /// One head of cross-attention (eq. 7): `softmax(Q K^T / sqrt(m)) V`.
 ///

@@ -4,9 +4,9 @@ use candle_core::{Result, Tensor};
 
 use super::activation::distribution;
 use super::composite;
-use super::kernels::categorical::{self, Divergence, Output};
 use super::node::{Backward, floats, fusible, mismatch, record};
 use super::rows::{self, RowOp};
+use rcwm_kernels::batch::categorical::{self, Divergence, Output};
 
 pub use super::composite::one_hot_of_best;
 

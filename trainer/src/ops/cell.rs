@@ -1,11 +1,11 @@
 use candle_core::{D, Result, Tensor};
 
 use super::composite;
-use super::kernels::gates;
-use super::kernels::norm::{Norm, NormGrads};
-use super::kernels::parallel;
 use super::node::{Backward, floats, fusible, mismatch, record_one};
 use super::norm::SHARE_NUMBERS_MIN;
+use super::parallel;
+use rcwm_kernels::batch::gates;
+use rcwm_kernels::batch::norm::{Norm, NormGrads};
 
 /// The gates of the recurrent cell: `gates` [B, 3d] holds `reset, cand, update` after their LayerNorm; gives
 /// `h' = update * cand + (1 - update) * h` [B, d], where `cand = tanh(sigmoid(reset) * cand)` and
@@ -135,7 +135,7 @@ impl Backward for Cell {
             let (pre, h, d_next) = (&pre[3 * from..3 * to], &h[from..to], &d_next[from..to]);
             gates::cell_backward(pre, norm, h, d_next, d_pre, dh, sums);
         });
-        let [gain, shift] = NormGrads::total(sums, 3 * d).into_tensors()?;
+        let [gain, shift] = super::norm::into_tensors(NormGrads::total(sums, 3 * d))?;
         let device = self.h.device();
         let d_pre = Tensor::from_vec(d_pre, self.pre.shape(), device)?;
         let dh = Tensor::from_vec(dh, self.h.shape(), device)?;

@@ -4,11 +4,11 @@ use std::ops::Range;
 
 use pulp::Arch;
 
-use super::kernels::conv::{
+use rcwm_kernels::batch::conv::{
     DoublePanels, Map, double, double_panels, halve, halve_panels, pad, weight_grads,
 };
-use super::kernels::norm::{self, Norm, NormGrads, add, add_rows, add_to_rows};
-use super::kernels::tile::{PANEL, Panels};
+use rcwm_kernels::batch::norm::{self, Norm, NormGrads, add, add_rows, add_to_rows};
+use rcwm_kernels::batch::tile::{PANEL, Panels};
 
 /// What a stack does to the sides.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
@@ -114,7 +114,8 @@ pub struct Scratch {
 
 impl Scratch {
     pub fn new(layers: &[Layer<'_>]) -> Self {
-        let largest = layers.iter().flat_map(|layer| [layer.from.len(), layer.to.len()]).max().unwrap_or(0);
+        let largest =
+            layers.iter().flat_map(|layer| [layer.from.numbers(), layer.to.numbers()]).max().unwrap_or(0);
         let buffer = || vec![0.0; largest + PANEL];
         Self {
             padded_from: layers.iter().map(|layer| vec![0.0; layer.from.padded_len()]).collect(),
@@ -131,12 +132,12 @@ impl Pass<'_> {
     pub fn forward(&self, x: &[f32], mut pre: Vec<&mut [f32]>, keep: bool, out: &mut [f32]) {
         let Some((first, last)) = self.layers.first().zip(self.layers.last()) else { return };
         let mut scratch = Scratch::new(&self.layers);
-        let images = x.chunks_exact(first.from.len()).zip(out.chunks_exact_mut(last.to.len()));
+        let images = x.chunks_exact(first.from.numbers()).zip(out.chunks_exact_mut(last.to.numbers()));
         for (image, (x, out)) in images.enumerate() {
             pad(x, first.from, &mut scratch.padded_from[0]);
             for (index, layer) in self.layers.iter().enumerate() {
                 let padded = &scratch.padded_from[index];
-                let size = layer.to.len();
+                let size = layer.to.numbers();
                 let Some(norm) = layer.norm else {
                     layer.convolve(self.arch, padded, layer.from, out);
                     if let Some(bias) = layer.bias {
@@ -172,10 +173,10 @@ impl Pass<'_> {
     ) {
         for (place, image) in share.enumerate() {
             let last = self.layers.len() - 1;
-            let size = self.layers[last].to.len();
+            let size = self.layers[last].to.numbers();
             scratch.d_out[..size].copy_from_slice(&d_out[image * size..][..size]);
             for index in (0..self.layers.len()).rev() {
-                let input_size = self.layers[index].from.len();
+                let input_size = self.layers[index].from.numbers();
                 match index.checked_sub(1).and_then(|before| Some((before, self.layers[before].norm?))) {
                     Some((before, norm)) => {
                         norm::forward(
@@ -188,7 +189,7 @@ impl Pass<'_> {
                         scratch.input[..input_size].copy_from_slice(&x[image * input_size..][..input_size])
                     }
                 }
-                let pre = pre.get(index).map(|pre| &pre[image * self.layers[index].to.len()..]);
+                let pre = pre.get(index).map(|pre| &pre[image * self.layers[index].to.numbers()..]);
                 self.layer_backward(index, pre, sums, scratch);
                 let d_input = if index > 0 {
                     &mut scratch.d_out[..input_size]
@@ -206,7 +207,7 @@ impl Pass<'_> {
     /// From the gradient in `d_out` to the padded one before the norm, and the gradients of the layer's parameters.
     fn layer_backward(&self, index: usize, pre: Option<&[f32]>, sums: &mut Gradients, scratch: &mut Scratch) {
         let layer = &self.layers[index];
-        let size = layer.to.len();
+        let size = layer.to.numbers();
         let Scratch { padded_from, padded_to, input, d_pre, d_out } = scratch;
         match (layer.norm, pre) {
             (Some(norm), Some(pre)) => {
@@ -227,7 +228,7 @@ impl Pass<'_> {
         let grads = &mut sums.weights[index];
         match self.direction {
             Direction::Down => {
-                pad(&input[..layer.from.len()], layer.from, &mut padded_from[index]);
+                pad(&input[..layer.from.numbers()], layer.from, &mut padded_from[index]);
                 weight_grads(self.arch, &padded_from[index], layer.from, d_pre, layer.to.channels, grads);
             }
             Direction::Up => {

@@ -7,10 +7,10 @@ use pulp::Arch;
 
 use super::composite;
 use super::conv_pass::{Direction, Gradients, Layer, Pass, Scratch};
-use super::kernels::conv::Map;
-use super::kernels::norm::{Norm, NormGrads};
-use super::kernels::parallel;
 use super::node::{Backward, Floats, floats, mismatch, record_one};
+use super::parallel;
+use rcwm_kernels::batch::conv::Map;
+use rcwm_kernels::batch::norm::Norm;
 
 /// One convolution and what follows it.
 #[derive(Debug, Clone, Copy)]
@@ -208,12 +208,12 @@ impl Kept {
     }
 
     fn shares(&self, batch: usize) -> Vec<Range<usize>> {
-        parallel::shares(batch, SHARE_NUMBERS_MIN.div_ceil(self.maps[0].len()))
+        parallel::shares(batch, SHARE_NUMBERS_MIN.div_ceil(self.maps[0].numbers()))
     }
 
     /// The last layer's output [B, map]; fills `pre` if asked to.
     fn forward(&mut self, batch: usize, keep: bool) -> Result<Vec<f32>> {
-        let last = self.maps[self.maps.len() - 1].len();
+        let last = self.maps[self.maps.len() - 1].numbers();
         let mut out = vec![0.0; batch * last];
         let shares = self.shares(batch);
         // Without gradients to come, the space of one image per share is enough.
@@ -228,18 +228,18 @@ impl Kept {
             .collect();
         let total = spaces.last().map_or(0, |space| space.end);
         let normed = self.layers.iter().zip(&self.maps[1..]).filter(|(layer, _)| layer.norm.is_some());
-        let mut pre: Vec<Vec<f32>> = normed.map(|(_, map)| vec![0.0; total * map.len()]).collect();
+        let mut pre: Vec<Vec<f32>> = normed.map(|(_, map)| vec![0.0; total * map.numbers()]).collect();
         {
             let locked = self.lock()?;
             let x = floats(self.direction.name(), &self.x)?;
             let pass = self.pass(&locked, false);
             let mut parts: Vec<Vec<&mut [f32]>> = shares.iter().map(|_| Vec::new()).collect();
             for (pre, map) in pre.iter_mut().zip(&self.maps[1..]) {
-                let split = parallel::split(pre, &spaces, map.len());
+                let split = parallel::split(pre, &spaces, map.numbers());
                 parts.iter_mut().zip(split).for_each(|(parts, part)| parts.push(part));
             }
             let outs = parallel::split(&mut out, &shares, last);
-            let (pass, first) = (&pass, self.maps[0].len());
+            let (pass, first) = (&pass, self.maps[0].numbers());
             let x = &*x;
             parallel::each(&shares, parts.into_iter().zip(outs), |share, (pre, out)| {
                 pass.forward(&x[share.start * first..share.end * first], pre, keep, out);
@@ -264,7 +264,7 @@ impl Backward for Kept {
         }
         let batch = self.x.dim(0)?;
         let shares = self.shares(batch);
-        let first = self.maps[0].len();
+        let first = self.maps[0].numbers();
         let mut dx = vec![0.0; if wanted[0] { batch * first } else { 0 }];
         let gradients = |_| Gradients::new(&self.maps, self.layers.iter().map(|layer| layer.norm.is_some()));
         let mut sums: Vec<Gradients> = shares.iter().map(gradients).collect();
@@ -305,7 +305,7 @@ impl Kept {
             };
             found.push(Some(Tensor::from_vec(weight, (first, second, 4, 4), &Device::Cpu)?));
             if layer.norm.is_some() {
-                found.extend(NormGrads::into_tensors(norm)?.map(Some));
+                found.extend(super::norm::into_tensors(norm)?.map(Some));
             }
             if layer.bias.is_some() {
                 let width = bias.len();

@@ -1,9 +1,9 @@
 use candle_core::{D, Result, Tensor};
 
 use super::composite;
-use super::kernels::gemm::{Matrix, product};
-use super::kernels::norm::add_rows;
+use super::gemm::{Matrix, product};
 use super::node::{Backward, Floats, floats, fusible, mismatch, record_one, row_strided};
+use rcwm_kernels::batch::norm::add_rows;
 
 /// `x W^T + b` over the last dimension: `x` [..., in], `weight` [out, in], `bias` [out], gives [..., out].
 ///

@@ -1,7 +1,8 @@
 //! Noise out of random words.
 
-use super::kernels::math::ln;
-use super::kernels::{parallel, vectorised};
+use super::parallel;
+use rcwm_kernels::batch::math::ln;
+use rcwm_kernels::vectorised;
 
 /// Words below which a second thread costs more than it gives.
 const SHARE_WORDS_MIN: usize = 32_768;

@@ -1,9 +1,9 @@
 use candle_core::{D, Result, Tensor};
 
 use super::composite;
-use super::kernels::norm::{self, Norm, NormGrads};
-use super::kernels::parallel;
 use super::node::{Backward, floats, fusible, mismatch, record_one};
+use super::parallel;
+use rcwm_kernels::batch::norm::{self, Norm, NormGrads};
 
 /// Numbers below which a second thread costs more than it gives.
 pub(super) const SHARE_NUMBERS_MIN: usize = 32_768;
@@ -105,26 +105,16 @@ impl Backward for Kept {
         });
         let total = NormGrads::total(sums, width);
         let dx = Tensor::from_vec(dx, self.x.shape(), self.x.device())?;
-        let [gain, shift] = total.into_tensors()?;
+        let [gain, shift] = into_tensors(total)?;
         Ok(vec![Some(dx), Some(gain), Some(shift)])
     }
 }
 
-impl NormGrads {
-    /// The sum of the shares' sums, in their order.
-    pub(super) fn total(sums: Vec<Self>, width: usize) -> Self {
-        sums.into_iter().fold(Self::new(width), |mut total, sum| {
-            total.add(&sum);
-            total
-        })
-    }
-
-    /// Gradients of gain and shift, [width].
-    pub(super) fn into_tensors(self) -> Result<[Tensor; 2]> {
-        let tensor = |values: Vec<f32>| {
-            let width = values.len();
-            Tensor::from_vec(values, width, &candle_core::Device::Cpu)
-        };
-        Ok([tensor(self.gain)?, tensor(self.shift)?])
-    }
+/// Gradients of gain and shift, [width].
+pub(super) fn into_tensors(grads: NormGrads) -> Result<[Tensor; 2]> {
+    let tensor = |values: Vec<f32>| {
+        let width = values.len();
+        Tensor::from_vec(values, width, &candle_core::Device::Cpu)
+    };
+    Ok([tensor(grads.gain)?, tensor(grads.shift)?])
 }

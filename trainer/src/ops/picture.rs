@@ -1,9 +1,9 @@
 use candle_core::{CpuStorage, DType, Device, Error, Result, Shape, Storage, Tensor};
 
 use super::composite;
-use super::kernels::parallel;
-use super::kernels::picture::{self, Masks, RAW, Target};
 use super::node::{Backward, floats, fusible, mismatch, record};
+use super::parallel;
+use rcwm_kernels::batch::picture::{self, Masks, RAW, Target};
 
 /// `x/255 - 0.5` of a u8 image, as f32; channels last. 5 bytes a number.
 ///

@@ -4,8 +4,8 @@ use std::ops::Range;
 
 use candle_core::{D, Result, Shape, Tensor};
 
-use super::kernels::parallel;
 use super::node::{Backward, floats, record_one};
+use super::parallel;
 
 /// Numbers below which a second thread costs more than it gives.
 const SHARE_NUMBERS_MIN: usize = 16_384;

@@ -5,9 +5,9 @@ use std::ops::Range;
 use candle_core::{Device, Result, Tensor};
 
 use super::composite;
-use super::kernels::categorical;
 use super::node::{floats, fusible, mismatch};
 use super::rows::{self, RowOp};
+use rcwm_kernels::batch::categorical;
 
 pub use super::composite::{symexp, symlog};
 

@@ -4,8 +4,8 @@ use rcwm_models::onnx::{Node, data_type};
 
 use super::super::graph::{Graph, float_attribute, int, ints, ints_attribute};
 use super::{everywhere, new_value, replace};
-use crate::kernels::conv::Conv;
 use crate::operators::{CONV, NORM};
+use rcwm_kernels::tick::conv::Conv;
 
 const TO_LAST: [i64; 4] = [0, 2, 3, 1];
 const TO_FIRST: [i64; 4] = [0, 3, 1, 2];

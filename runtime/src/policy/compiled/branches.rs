@@ -15,7 +15,7 @@ use super::super::PolicyError;
 use super::super::stages::StageClock;
 use super::pieces::{Piece, Values};
 use crate::operators::SharedTeam;
-use crate::team::{Job, TIMEOUT_MIN, try_lock};
+use rcwm_kernels::team::{Job, TIMEOUT_MIN, try_lock};
 
 /// The helper is late when the caller has waited for this part of the time that its own branch has taken.
 const TIMEOUT_DIVISOR: u32 = 4;
@@ -203,7 +203,7 @@ mod tests {
 
     use super::*;
     use crate::compile::{Fact, Segment};
-    use crate::team::Team;
+    use rcwm_kernels::team::Team;
 
     const LEN: usize = 8;
 

@@ -2,7 +2,7 @@
 
 use pulp::{Arch, Simd, WithSimd};
 
-use super::math::{exp, ln};
+use crate::simd::{exp, ln};
 
 /// `x` [rows, classes], logits, becomes `ln(factor * softmax(x) + offset)` in place (`offset` is the share of the uniform distribution that is mixed in).
 ///

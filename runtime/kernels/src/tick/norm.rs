@@ -2,7 +2,7 @@
 
 use pulp::{Arch, Simd, WithSimd};
 
-use super::math::sigmoid;
+use crate::simd::sigmoid;
 
 /// Parameters of a norm over the last dimension.
 #[derive(Debug, Clone, PartialEq)]

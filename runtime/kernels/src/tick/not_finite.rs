@@ -4,16 +4,16 @@ use pulp::Arch;
 
 use super::conv::Conv;
 use super::latents::{divergence, log_probs};
-use super::math::tests::{Each, Exp, Function, Ln, Sigmoid};
 use super::matrix::Matrix;
 use super::norm::Norm;
 use super::table::Table;
 use super::weights::Precision;
+use crate::simd::tests::{Each, Exp, Function, Ln, Sigmoid};
 
 const BAD: [f32; 3] = [f32::NAN, f32::INFINITY, f32::NEG_INFINITY];
 
 /// Every level of instructions that this machine can run.
-pub(super) fn levels() -> Vec<(&'static str, Arch)> {
+pub(crate) fn levels() -> Vec<(&'static str, Arch)> {
     let mut levels = vec![("scalar", Arch::Scalar), ("best", Arch::new())];
     #[cfg(target_arch = "x86_64")]
     levels.extend(pulp::x86::V3::try_new().map(|simd| ("AVX2", Arch::V3(simd))));

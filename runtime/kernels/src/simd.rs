@@ -14,7 +14,7 @@ const ATANH: [f32; 6] = [2.0 / 11.0, 2.0 / 9.0, 2.0 / 7.0, 2.0 / 5.0, 2.0 / 3.0,
 
 /// `e^x`; a finite x is held within -87 and 88. What is not finite gives NaN.
 #[inline(always)]
-pub(super) fn exp<S: Simd>(simd: S, x: S::f32s) -> S::f32s {
+pub(crate) fn exp<S: Simd>(simd: S, x: S::f32s) -> S::f32s {
     let splat = |value: f32| simd.splat_f32s(value);
     // 0, or NaN where x is not finite: which operand of minimum and maximum wins there differs from processor to processor.
     let poison = simd.sub_f32s(x, x);
@@ -33,14 +33,14 @@ pub(super) fn exp<S: Simd>(simd: S, x: S::f32s) -> S::f32s {
 
 /// `1 / (1 + e^-x)`.
 #[inline(always)]
-pub(super) fn sigmoid<S: Simd>(simd: S, x: S::f32s) -> S::f32s {
+pub(crate) fn sigmoid<S: Simd>(simd: S, x: S::f32s) -> S::f32s {
     let one = simd.splat_f32s(1.0);
     simd.div_f32s(one, simd.add_f32s(one, exp(simd, simd.neg_f32s(x))))
 }
 
 /// `ln x` of a positive, normal x; NaN stays NaN.
 #[inline(always)]
-pub(super) fn ln<S: Simd>(simd: S, x: S::f32s) -> S::f32s {
+pub(crate) fn ln<S: Simd>(simd: S, x: S::f32s) -> S::f32s {
     let splat = |value: f32| simd.splat_f32s(value);
     // x = 2^n * f with f in [sqrt(1/2), sqrt(2)): the offset moves the border from 1 to sqrt(1/2).
     const OFFSET: u32 = 0x3f80_0000 - 0x3f35_04f3;
@@ -66,16 +66,16 @@ pub(super) fn ln<S: Simd>(simd: S, x: S::f32s) -> S::f32s {
 }
 
 #[cfg(test)]
-pub(super) mod tests {
+pub(crate) mod tests {
     use super::*;
     use pulp::WithSimd;
 
-    use super::super::not_finite::levels;
+    use crate::tick::not_finite::levels;
 
     /// A function of every number of the first into the second; whole registers of them.
-    pub(in super::super) struct Each<'a, F>(pub &'a [f32], pub &'a mut [f32], pub F);
+    pub(crate) struct Each<'a, F>(pub &'a [f32], pub &'a mut [f32], pub F);
 
-    pub(in super::super) trait Function {
+    pub(crate) trait Function {
         fn at<S: Simd>(&self, simd: S, x: S::f32s) -> S::f32s;
     }
 
@@ -89,11 +89,11 @@ pub(super) mod tests {
     }
 
     #[derive(Clone, Copy)]
-    pub(in super::super) struct Exp;
+    pub(crate) struct Exp;
     #[derive(Clone, Copy)]
-    pub(in super::super) struct Ln;
+    pub(crate) struct Ln;
     #[derive(Clone, Copy)]
-    pub(in super::super) struct Sigmoid;
+    pub(crate) struct Sigmoid;
 
     impl Function for Exp {
         fn at<S: Simd>(&self, simd: S, x: S::f32s) -> S::f32s {

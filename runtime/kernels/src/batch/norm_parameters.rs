@@ -1,6 +1,6 @@
 //! Gain and shift of a normalisation, and their gradients.
 
-use super::vectorised;
+use crate::vectorised;
 
 /// What a normalisation is made of.
 #[derive(Debug, Clone, Copy)]
@@ -28,6 +28,15 @@ impl NormGrads {
     /// Zeros.
     pub fn new(width: usize) -> Self {
         Self { gain: vec![0.0; width], shift: vec![0.0; width] }
+    }
+
+    /// The sum of the shares' sums, in their order.
+    #[must_use]
+    pub fn total(sums: Vec<Self>, width: usize) -> Self {
+        sums.into_iter().fold(Self::new(width), |mut total, sum| {
+            total.add(&sum);
+            total
+        })
     }
 
     /// Adds another sum.

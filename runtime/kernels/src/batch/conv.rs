@@ -21,7 +21,7 @@ pub struct Map {
 
 impl Map {
     /// Numbers in it.
-    pub fn len(self) -> usize {
+    pub fn numbers(self) -> usize {
         self.height * self.width * self.channels
     }
 

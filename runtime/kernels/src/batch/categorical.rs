@@ -4,7 +4,7 @@
 //! `(1 - u) s (g - sum(s g))` with `s` the softmax and `g` the gradient of `p`.
 
 use super::math::{exp, largest, ln, sum_of, sum_of_pairs};
-use super::vectorised;
+use crate::vectorised;
 
 /// `softmax(logits)` of one row; gives the largest logit and the sum of exponentials above it.
 #[inline(always)]
@@ -269,7 +269,7 @@ pub fn entropy_backward(logits: &[f32], classes: usize, unimix: f32, d_out: &[f3
 }
 
 /// Mean of `softmax(logits)` over `bins`, [rows]; the bins are odd in number and symmetric around 0, and are summed in
-/// pairs (see [`crate::ops::two_hot_mean`]). About 25 flops and 4 bytes a logit.
+/// pairs (see `two_hot_mean`). About 25 flops and 4 bytes a logit.
 pub fn mean(logits: &[f32], bins: &[f32], out: &mut [f32]) {
     let half = bins.len() / 2;
     vectorised(

@@ -5,7 +5,7 @@ use pulp::Arch;
 use super::categorical::{self, Output};
 use super::math::sum_of_pairs;
 use super::tile::{Job, PANEL};
-use super::vectorised;
+use crate::vectorised;
 
 /// Sizes of one row of the batch.
 #[derive(Debug, Clone, Copy)]

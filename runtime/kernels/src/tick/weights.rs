@@ -4,8 +4,7 @@ use half::f16;
 use pulp::Simd;
 
 /// How weights are kept. Arithmetic is in f32 either way.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, Default, serde::Serialize, clap::ValueEnum)]
-#[serde(rename_all = "lowercase")]
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
 pub enum Precision {
     /// As exported.
     #[default]

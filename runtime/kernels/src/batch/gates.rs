@@ -2,7 +2,7 @@
 
 use super::math::{sigmoid, tanh};
 use super::norm::{self, Norm, NormGrads};
-use super::vectorised;
+use crate::vectorised;
 
 #[inline(always)]
 fn update_row(gates: &[f32], h: &[f32], next: &mut [f32]) {

@@ -5,31 +5,8 @@
 
 use pulp::{Arch, Simd, WithSimd};
 
-use super::math::{LN_2_HIGH, LN_2_LOW, ROUND};
 use super::norm_parameters::{Norm, NormGrads};
-
-/// The polynomial of [`math::exp`](super::math::exp): 1/8! to 1/2!, then 1, 1.
-const EXP: [f32; 9] =
-    [1.0 / 40_320.0, 1.0 / 5_040.0, 1.0 / 720.0, 1.0 / 120.0, 1.0 / 24.0, 1.0 / 6.0, 0.5, 1.0, 1.0];
-
-/// `1 / (1 + e^-x)`, as [`math::sigmoid`](super::math::sigmoid).
-#[inline(always)]
-fn sigmoid<S: Simd>(simd: S, x: S::f32s) -> S::f32s {
-    let splat = |value: f32| simd.splat_f32s(value);
-    // The second operand wins where one is NaN.
-    let x = simd.min_f32s(splat(88.0), simd.max_f32s(splat(-87.0), simd.neg_f32s(x)));
-    let shifted = simd.mul_add_f32s(x, splat(std::f32::consts::LOG2_E), splat(ROUND));
-    let n = simd.sub_f32s(shifted, splat(ROUND));
-    let r = simd.mul_add_f32s(n, splat(-LN_2_HIGH), x);
-    let r = simd.mul_add_f32s(n, splat(-LN_2_LOW), r);
-    let mut p = splat(EXP[0]);
-    for term in &EXP[1..] {
-        p = simd.mul_add_f32s(r, p, splat(*term));
-    }
-    let power = simd.wrapping_dyn_shl_u32s(simd.transmute_u32s_f32s(shifted), simd.splat_u32s(23));
-    let exp = simd.transmute_f32s_u32s(simd.add_u32s(simd.transmute_u32s_f32s(p), power));
-    simd.div_f32s(splat(1.0), simd.add_f32s(splat(1.0), exp))
-}
+use crate::simd::sigmoid;
 
 /// Sum over all lanes of all vectors, in every lane.
 #[inline(always)]

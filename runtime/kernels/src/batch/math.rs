@@ -1,15 +1,15 @@
 //! Elementary functions without branches, so that loops over them become vector instructions.
 //!
 //! Every function is `#[inline(always)]`: it is compiled for the instruction set of the loop that calls it (see
-//! [`vectorised`](super::vectorised)). Range reduction by powers of two, then Taylor polynomials that are short of f32's precision by
+//! [`vectorised`](crate::vectorised)). Range reduction by powers of two, then Taylor polynomials that are short of f32's precision by
 //! less than a unit in the last place.
 
 /// `1.5 * 2^23`: adding it rounds to an integer, which then stands in the low bits.
-pub const ROUND: f32 = 12_582_912.0;
+const ROUND: f32 = 12_582_912.0;
 /// ln 2 in two parts; the first has few enough bits for its product with a small integer to be exact.
-pub const LN_2_HIGH: f32 = 0.693_145_75;
+const LN_2_HIGH: f32 = 0.693_145_75;
 /// The rest of ln 2.
-pub const LN_2_LOW: f32 = 1.428_606_8e-6;
+const LN_2_LOW: f32 = 1.428_606_8e-6;
 
 /// `(r, n << 23)` with `x = n ln 2 + r` and `|r| <= ln 2 / 2`.
 #[inline(always)]

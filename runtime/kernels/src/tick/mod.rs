@@ -13,10 +13,9 @@
 
 pub mod conv;
 pub mod latents;
-mod math;
 pub mod matrix;
 pub mod norm;
 #[cfg(test)]
-mod not_finite;
+pub(crate) mod not_finite;
 pub mod table;
 pub mod weights;

@@ -3,7 +3,7 @@
 use std::sync::OnceLock;
 
 use super::math::sigmoid;
-use super::vectorised;
+use crate::vectorised;
 
 /// Channels of a decoder's raw output: three of the image and a mask logit.
 pub const RAW: usize = 4;

@@ -2,7 +2,8 @@
 
 use super::math::{silu, silu_slope};
 pub use super::norm_parameters::{Norm, NormGrads, add};
-use super::{norm_vector, vectorised};
+use super::norm_vector;
+use crate::vectorised;
 
 /// Calls `$body` with the widest `N` of 16, 8, 4, 1 that divides `$width`: chunks of `N` then make up a row.
 macro_rules! with_lanes {
