@@ -28,6 +28,8 @@ const NEVER: Duration = Duration::from_secs(10);
 /// Long enough to take events that are there already.
 const AT_ONCE: Duration = Duration::from_micros(30);
 
+/// Events that are left in the link before they are taken: taking them sleeps for a moment of real time.
+const EVENTS_MAX: u32 = 64;
 /// Of so many times that the controller wants to clean up after dead peers, one is done.
 const CLEANED_EVERY: u64 = 50;
 
@@ -49,8 +51,6 @@ pub(crate) struct World {
     steps: VecDeque<(usize, Step)>,
     rng: ChaCha8Rng,
     now_ns: u64,
-    /// The controller's last look at its clock.
-    seen_ns: u64,
     /// When the peer did its last deed.
     last_ns: u64,
     /// The message in the link that was not taken.
@@ -92,7 +92,6 @@ impl World {
             steps,
             rng,
             now_ns: START_NS,
-            seen_ns: START_NS,
             last_ns: START_NS,
             waiting: None,
             closing: false,
@@ -161,7 +160,7 @@ impl World {
             }
             Deed::Notify(event) => {
                 self.closing |= event == 2;
-                self.events += 1;
+                self.events += EVENTS_MAX;
                 self.wire.notify(event)
             }
             Deed::Restart { counts_on } => {
@@ -186,7 +185,6 @@ impl World {
             let until_ns = self.now_ns + self.work_ns();
             self.pass(until_ns);
         }
-        self.seen_ns = self.now_ns;
         self.judge.looked(self.now_ns);
         self.note();
         self.now_ns
@@ -220,7 +218,11 @@ impl World {
             self.tail += 1;
             self.stop.fetch_or(self.tail > TAIL_WAITS, Ordering::Relaxed);
         }
-        if std::mem::take(&mut self.events) > 0 { Waited::Events } else { Waited::Nothing }
+        if self.events < EVENTS_MAX {
+            return Waited::Nothing;
+        }
+        self.events = 0;
+        Waited::Events
     }
 
     /// Something may have come of a swap that was asked for.
@@ -239,7 +241,7 @@ impl World {
     fn sent(&mut self) {
         let action = self.wire.action().expect("the peer's end of the link works");
         let action = action.expect("what was sent is on the wire");
-        self.judge.sent(&action, self.waiting.as_ref(), self.now_ns, self.seen_ns);
+        self.judge.sent(&action, self.waiting.as_ref(), self.now_ns);
         self.counts.sent = action.action;
         if !self.setup.deaf {
             self.wire.is_told().expect("the peer's end of the link works");

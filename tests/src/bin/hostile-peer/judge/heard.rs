@@ -22,6 +22,8 @@ pub(crate) struct Heard {
     pub(super) executed: Vector,
     pub(super) is_finite: bool,
     pub(super) received_ns: u64,
+    /// When the controller looked at it at the latest, once that is known.
+    pub(super) taken_ns: u64,
 }
 
 impl Heard {
@@ -37,6 +39,7 @@ impl Heard {
             executed: message.executed_action,
             is_finite: message.is_finite(),
             received_ns,
+            taken_ns: received_ns,
         }
     }
 
@@ -55,7 +58,7 @@ impl Heard {
     fn base_ns(&self) -> (u64, u64) {
         let published_ns = self.published_ns.min(self.received_ns);
         let scheduled_ns = if self.scheduled_ns > self.received_ns { 0 } else { self.scheduled_ns };
-        (scheduled_ns.max(published_ns), self.scheduled_ns.max(self.published_ns).min(self.received_ns))
+        (scheduled_ns.max(published_ns), self.scheduled_ns.max(self.published_ns).min(self.taken_ns))
     }
 
     /// Whether its clock can be read in a way that makes it too old.

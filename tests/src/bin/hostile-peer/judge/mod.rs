@@ -51,6 +51,8 @@ struct Newest {
     unclear: bool,
     /// What was executed, as it said when it came again.
     executed_again: Option<Vector>,
+    /// No stand-in may come any more.
+    exhausted: bool,
 }
 
 impl Newest {
@@ -92,7 +94,13 @@ pub(crate) struct Judge {
     fallbacks: u64,
     /// Messages since then that were found in the middle of a tick: as many ticks may have been counted and not sent.
     unsent: u64,
+    /// The controller may have fallen silent since, and begins anew with the next message.
+    silent: bool,
     due: Due,
+    /// The controller's last two looks at its clock.
+    looks_ns: [u64; 2],
+    /// No rate limit can hold for the last action: it was the first position, and where the robot stood was not known.
+    is_free: bool,
     /// Where the last action may have started from, for the check of what the policy decided.
     bases: Vec<Vector>,
     /// The action before the last, of the same episode.
@@ -118,7 +126,10 @@ impl Judge {
             imagined: 0,
             fallbacks: 0,
             unsent: 0,
+            silent: false,
             due: Due::default(),
+            looks_ns: [0; 2],
+            is_free: false,
             bases: Vec::new(),
             before: None,
             received: 0,
@@ -185,6 +196,7 @@ impl Judge {
         if begins {
             self.in_episode = false;
         }
+        self.begins_anew();
         let says_nothing =
             heard.flags.contains(ObservationFlags::FIRST) && heard.executed == [0.0; ACTION_LEN];
         self.is_held |= heard.is_executable() && !says_nothing;
@@ -199,6 +211,7 @@ impl Judge {
             follows,
             unclear: false,
             executed_again: None,
+            exhausted: false,
         });
     }
 
@@ -209,7 +222,15 @@ impl Judge {
         newest.may_be_dropped() && self.previous.is_none_or(|(previous, _)| follows(&previous.heard))
     }
 
+    /// A message that is not old ends a silence.
+    fn begins_anew(&mut self) {
+        if std::mem::take(&mut self.silent) {
+            (self.imagined, self.fallbacks, self.unsent) = (0, 0, 0);
+        }
+    }
+
     fn received_again(&mut self, heard: &Heard) {
+        self.begins_anew();
         let Some(newest) = &mut self.newest else { return };
         // Which of two schedules counts depends on what was imagined meanwhile.
         let same = |a: &Heard, b: &Heard| {
@@ -237,8 +258,9 @@ impl Judge {
         }
     }
 
-    /// The peer's closing reached the controller: nothing is due.
+    /// The peer's closing reached the controller, which begins anew with the next message.
     pub(crate) fn closed(&mut self) {
+        self.silent = true;
         if let Some(newest) = &mut self.newest {
             newest.follows = false;
         }
@@ -247,6 +269,7 @@ impl Judge {
 
     /// The controller looked at its clock.
     pub(crate) fn looked(&mut self, now_ns: u64) {
+        self.looks_ns = [self.looks_ns[1], now_ns];
         let Some(newest) = self.newest.filter(|newest| newest.follows && newest.answer.is_some()) else {
             return;
         };
@@ -262,10 +285,12 @@ impl Judge {
         let left = self.imagined + self.unsent < u64::from(imagined_max) && self.fallbacks == 0
             || self.fallbacks + self.unsent < u64::from(fallbacks_max);
         self.due.is_due |= left && !self.may_withhold();
-        if !left && self.fallbacks >= u64::from(fallbacks_max) {
-            // It has fallen silent, and begins anew with the next message.
-            (self.imagined, self.fallbacks, self.unsent) = (0, 0, 0);
-            self.closed();
+        if !left {
+            // It has fallen silent, for certain where all of them were sent.
+            self.silent = true;
+            if let Some(newest) = &mut self.newest {
+                newest.exhausted = self.fallbacks >= u64::from(fallbacks_max);
+            }
         }
     }
 
@@ -293,9 +318,8 @@ impl Judge {
         }
     }
 
-    /// An action is on the wire. `waiting` is the message in the link that the controller has not taken, and `seen_ns` the controller's
-    /// last look at its clock.
-    pub(crate) fn sent(&mut self, action: &Action, waiting: Option<&Heard>, now_ns: u64, seen_ns: u64) {
+    /// An action is on the wire. `waiting` is the message in the link that the controller has not taken.
+    pub(crate) fn sent(&mut self, action: &Action, waiting: Option<&Heard>, now_ns: u64) {
         self.sent.all += 1;
         (action.answers, action.source, action.action.map(f32::to_bits)).hash(&mut self.digest);
         let Some(source) = ActionSource::from_wire(action.source) else {
@@ -313,14 +337,15 @@ impl Judge {
         let Some(newest) = self.newest else {
             return self.object("answers nothing", || format!("{action:?} before any message"));
         };
-        self.turned_stale(seen_ns);
+        self.turned_stale(self.looks_ns[1]);
         let newest = self.newest_for(action, source).unwrap_or(newest);
         self.bases = self.bases_of(&newest);
         self.before = self.last.filter(|_| self.in_episode);
+        self.is_free = self.may_withhold();
         self.check_rate(action);
         self.check_target(action, source);
         if action.answers == newest.heard.sequence {
-            self.answered(action, source, newest, waiting, seen_ns);
+            self.answered(action, source, newest, waiting);
         } else if action.answers > newest.heard.sequence {
             self.stood_in(action, source, newest, now_ns);
         } else {
@@ -363,7 +388,7 @@ impl Judge {
     }
 
     fn check_rate(&mut self, action: &Action) {
-        let Some(rate_max) = self.setup.rate_max else { return };
+        let Some(rate_max) = self.setup.rate_max.filter(|_| !self.is_free) else { return };
         let near = |base: &Vector, limits: &ActionLimits| {
             let base = base.map(f64::from);
             (0..ACTION_LEN).all(|i| {
@@ -387,7 +412,7 @@ impl Judge {
     fn is_made_of(&self, action: &Action, target: &Vector) -> bool {
         let made = |limits: &ActionLimits, base: &Vector, i: usize| {
             let wanted = target[i].clamp(limits.low[i], limits.high[i]);
-            let Some(rate_max) = self.setup.rate_max else { return wanted };
+            let Some(rate_max) = self.setup.rate_max.filter(|_| !self.is_free) else { return wanted };
             let near = |base: f32| (base - rate_max, base + rate_max);
             let (mut low, mut high) = near(base[i]);
             // Near to what was sent last, too, where that is possible.
@@ -456,8 +481,12 @@ impl Judge {
         source: ActionSource,
         mut newest: Newest,
         waiting: Option<&Heard>,
-        seen_ns: u64,
     ) {
+        // It was taken at the look before the last, or earlier: the last asks whether its time is over.
+        let [taken_ns, seen_ns] = self.looks_ns;
+        if newest.answer.is_none() {
+            newest.heard.taken_ns = taken_ns.max(newest.heard.received_ns);
+        }
         let heard = newest.heard;
         if let Some(first) = newest.answer {
             self.sent.repeated += 1;
@@ -471,12 +500,12 @@ impl Judge {
             }
             if newest.stand_ins > 0 {
                 newest.stand_ins = 0;
-                newest.follows = false;
+                (newest.follows, newest.exhausted) = (false, false);
             }
             self.newest = Some(newest);
             return;
         }
-        let over_ns = heard.scheduled_ns.min(heard.received_ns).saturating_add(heard.period_ns);
+        let over_ns = heard.scheduled_ns.min(heard.taken_ns).saturating_add(heard.period_ns);
         if let Some(other) = waiting
             && heard.period_ns > 0
             && seen_ns > over_ns
@@ -517,6 +546,9 @@ impl Judge {
         }
         if newest.follows && now_ns < heard.due_ns(ticks, self.setup.pacing.grace_periods).0 {
             self.object("stand-in", || format!("{action:?} at {now_ns} is too early after {heard:?}"));
+        }
+        if newest.exhausted {
+            self.object("too many", || format!("{action:?} after as many as are allowed after {heard:?}"));
         }
         if ticks <= newest.stand_ins {
             self.object("stand-in", || format!("{action:?} comes again"));

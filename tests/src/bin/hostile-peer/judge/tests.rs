@@ -58,7 +58,8 @@ fn action(answers: u64, source: ActionSource, value: f32) -> Action {
 }
 
 fn send(judge: &mut Judge, action: Action, now_ns: u64) {
-    judge.sent(&action, None, now_ns, now_ns);
+    judge.looked(now_ns);
+    judge.sent(&action, None, now_ns);
 }
 
 /// Message 1 and its answer, then whatever follows.
@@ -141,7 +142,9 @@ fn an_answer_to_anything_but_the_newest_message_is_stale() {
     let overtaken = after_one(setup(), |judge| {
         hear(judge, &message(2));
         let newer = Heard::new(1, &message(4), 0);
-        judge.sent(&action(2, ActionSource::Policy, 0.1), Some(&newer), at_ns(4), at_ns(4));
+        judge.looked(at_ns(2));
+        judge.looked(at_ns(4));
+        judge.sent(&action(2, ActionSource::Policy, 0.1), Some(&newer), at_ns(4));
     });
     assert_eq!(overtaken, Some("overtaken"));
 }
