@@ -118,6 +118,29 @@ fn a_peer_that_has_lost_the_answer_gets_it_again_whatever_was_imagined_since() {
 }
 
 #[test]
+fn an_answer_that_the_robot_is_too_far_from_by_now_is_the_same_whenever_it_is_asked_for_again() {
+    let link = own_link();
+    let peer = link.peer();
+    let controller = start_controller_with(&smallest_bundle(), &link, |settings| {
+        (settings.rate_max, settings.fallback) = (Some(0.01), Fallback::Given([1.0; 4]));
+        settings.ticks = TickLimits { imagined_ticks_max: 0, fallback_ticks_max: 1000 };
+    });
+    let first = ask(&peer, &due_now(0)).action;
+    // Two fallbacks further than the first answer is.
+    let executed = next(&peer, "fallback", |action| action.action[0] > first[0] + 0.015).action;
+    let again = || {
+        let mut again = due_now(0);
+        (again.executed_action, again.flags) = (executed, again.flags | ObservationFlags::REPEATED.0);
+        ask(&peer, &again).action
+    };
+    let second = again();
+    assert!(second[0] > first[0], "{second:?} is nearer to {executed:?} than {first:?}");
+    assert_eq!((again(), again()), (second, second));
+    peer.close().unwrap();
+    controller.join().unwrap().0.unwrap();
+}
+
+#[test]
 fn an_observation_that_was_due_long_ago_is_dropped_and_counted() {
     let link = own_link();
     let peer = link.peer();

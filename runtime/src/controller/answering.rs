@@ -87,6 +87,10 @@ impl Controller {
             return Ok(Taken::Again);
         }
         let answer = self.send(sequence, source, Some(own.action))?;
+        if answer.published_ns > 0 {
+            // Where the gate has changed it, since the robot stands elsewhere by now, this is what is the same from here on.
+            self.own_answer = Some(answer);
+        }
         if went_on {
             self.work_ahead((!observation.is(ObservationFlags::LAST)).then_some(&answer.action));
         }
