@@ -151,7 +151,7 @@ impl World {
                 let message = draft.fill(&mut self.counts, self.now_ns);
                 self.messages += 1;
                 self.events += u32::from(draft.wakes);
-                self.waiting = Some(Heard::new(self.wire.publisher(), &message, 0));
+                self.waiting = Some(Heard::new(self.wire.publisher(), &message, self.now_ns));
                 self.wire.publish(message, draft.wakes)
             }
             Deed::Close => {

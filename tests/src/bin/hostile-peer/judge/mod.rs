@@ -37,7 +37,7 @@ pub(crate) struct Violation {
 #[derive(Debug, Clone, Copy)]
 struct Newest {
     heard: Heard,
-    /// Its first answer.
+    /// Its answer, as it was sent last.
     answer: Option<Action>,
     /// Stand-ins since.
     stand_ins: u64,
@@ -82,8 +82,9 @@ pub(crate) struct Judge {
     /// The running bundle; two where a swap may or may not have happened.
     running: Vec<Known>,
     newest: Option<Newest>,
-    /// The one before, and whether its episode had begun: where the newest turned stale on the way, this one still is the newest.
-    previous: Option<(Newest, bool)>,
+    /// Those before, and whether their episodes had begun. The first was not dropped for certain; all others may have turned stale on
+    /// the way, and so may the newest, so that each of them may still be the newest to the controller.
+    previous: Vec<(Newest, bool)>,
     last: Option<Action>,
     /// `last` belongs to the running episode.
     in_episode: bool,
@@ -99,6 +100,8 @@ pub(crate) struct Judge {
     due: Due,
     /// The controller's last two looks at its clock.
     looks_ns: [u64; 2],
+    /// The controller's last look at the link, other than to wait.
+    polled_ns: u64,
     /// No rate limit can hold for the last action: it was the first position, and where the robot stood was not known.
     is_free: bool,
     /// Where the last action may have started from, for the check of what the policy decided.
@@ -119,7 +122,7 @@ impl Judge {
             setup,
             running: vec![running],
             newest: None,
-            previous: None,
+            previous: Vec::new(),
             last: None,
             in_episode: false,
             is_held: false,
@@ -129,6 +132,7 @@ impl Judge {
             silent: false,
             due: Due::default(),
             looks_ns: [0; 2],
+            polled_ns: 0,
             is_free: false,
             bases: Vec::new(),
             before: None,
@@ -189,9 +193,11 @@ impl Judge {
             }
             _ => true,
         };
-        match self.newest {
-            Some(newest) if newest.may_be_dropped() => {}
-            newest => self.previous = newest.map(|newest| (newest, self.in_episode)),
+        if let Some(newest) = self.newest {
+            if !newest.may_be_dropped() {
+                self.previous.clear();
+            }
+            self.previous.push((newest, self.in_episode));
         }
         if begins {
             self.in_episode = false;
@@ -215,17 +221,24 @@ impl Judge {
         });
     }
 
-    /// Whether a message that is older than the newest is newer than the one before, in case the newest was dropped.
+    /// Whether a message that is older than the newest is newer than one before, in case all since were dropped.
     fn may_follow_previous(&self, newest: &Newest, heard: &Heard) -> bool {
         let follows =
             |previous: &Heard| previous.publisher != heard.publisher || previous.sequence < heard.sequence;
-        newest.may_be_dropped() && self.previous.is_none_or(|(previous, _)| follows(&previous.heard))
+        let mut before = self.previous.iter();
+        newest.may_be_dropped()
+            && (self.previous.is_empty() || before.any(|(previous, _)| follows(&previous.heard)))
     }
 
     /// A message that is not old ends a silence.
     fn begins_anew(&mut self) {
+        let used_up = self.fallbacks + self.unsent >= u64::from(self.setup.ticks.fallback_ticks_max);
         if std::mem::take(&mut self.silent) {
             (self.imagined, self.fallbacks, self.unsent) = (0, 0, 0);
+        } else if used_up && self.newest.is_some_and(|newest| newest.unclear || newest.may_be_dropped()) {
+            // Where it is not known what was due, neither is whether it has fallen silent.
+            self.unsent += self.imagined + self.fallbacks;
+            (self.imagined, self.fallbacks) = (0, 0);
         }
     }
 
@@ -307,6 +320,7 @@ impl Judge {
             }
         }
         if !waits {
+            self.polled_ns = now_ns;
             return;
         }
         if let Some(newest) = self.newest
@@ -356,17 +370,18 @@ impl Judge {
         self.due = Due::default();
     }
 
-    /// The newest message when this was sent: the one before where the newest had turned stale on the way, and this is for none or for
-    /// another.
+    /// The newest message when this was sent: one before where those since may have turned stale on the way, and this is for none of
+    /// them.
     fn newest_for(&mut self, action: &Action, source: ActionSource) -> Option<Newest> {
-        let newest = self.newest?;
-        let for_it = action.answers == newest.heard.sequence && source != ActionSource::Imagined;
-        if newest.may_be_dropped()
-            && !for_it
-            && let Some((previous, in_episode)) = self.previous
+        let is_for = |newest: &Newest| {
+            action.answers == newest.heard.sequence && source != ActionSource::Imagined
+        };
+        while let Some(newest) = self.newest
+            && newest.may_be_dropped()
+            && !is_for(&newest)
+            && let Some((previous, in_episode)) = self.previous.pop()
         {
-            self.in_episode = in_episode;
-            self.newest = Some(previous);
+            (self.newest, self.in_episode) = (Some(previous), in_episode);
         }
         self.newest
     }
@@ -502,13 +517,19 @@ impl Judge {
                 newest.stand_ins = 0;
                 (newest.follows, newest.exhausted) = (false, false);
             }
+            // Where it has changed, it is this one that is given from here on.
+            (newest.answer, newest.swapped) = (Some(*action), self.running.len() > 1);
             self.newest = Some(newest);
             return;
         }
         let over_ns = heard.scheduled_ns.min(heard.taken_ns).saturating_add(heard.period_ns);
+        // It looks once, when the time is over; what comes later cannot be known.
+        let came_later =
+            |other: &Heard| self.polled_ns > over_ns.max(taken_ns) && other.received_ns > self.polled_ns;
         if let Some(other) = waiting
             && heard.period_ns > 0
             && seen_ns > over_ns
+            && !came_later(other)
             && (other.publisher != heard.publisher || other.sequence > heard.sequence)
             && !other.is_stale_at(seen_ns, self.setup.pacing.stale_periods)
         {

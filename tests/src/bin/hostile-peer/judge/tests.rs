@@ -150,6 +150,96 @@ fn an_answer_to_anything_but_the_newest_message_is_stale() {
 }
 
 #[test]
+fn what_comes_after_the_controller_has_looked_whether_it_is_overtaken_cannot_be_known() {
+    let overtaken_by = |came_ns: u64| {
+        after_one(setup(), |judge| {
+            hear(judge, &message(2));
+            judge.looked(at_ns(2));
+            judge.looked(at_ns(3) + 1);
+            judge.looks_at_link(at_ns(3) + 2, false);
+            let newer = Heard::new(1, &message(4), came_ns);
+            judge.sent(&action(2, ActionSource::Policy, 0.1), Some(&newer), at_ns(3) + 9);
+        })
+    };
+    assert_eq!(overtaken_by(at_ns(3) + 2), Some("overtaken"));
+    assert_eq!(overtaken_by(at_ns(3) + 3), None);
+}
+
+#[test]
+fn each_of_those_that_may_have_turned_stale_may_be_the_one_that_is_answered() {
+    let answered = |sequence| {
+        after_one(setup(), |judge| {
+            let mut older = message(2);
+            (older.scheduled_ns, older.published_ns) = (at_ns(5), at_ns(5));
+            hear(judge, &message(4));
+            hear(judge, &message(3));
+            judge.received(Heard::new(1, &older, at_ns(6) + 1), true);
+            send(judge, action(sequence, ActionSource::Policy, 0.1), at_ns(6) + 2);
+        })
+    };
+    assert_eq!((answered(2), answered(4)), (None, None));
+    assert_eq!(answered(3), Some("marked"), "4 was there, and fresh");
+}
+
+#[test]
+fn a_message_that_comes_again_is_answered_as_it_was_last() {
+    let answered = |values: [f32; 2]| {
+        after_one(setup(), |judge| {
+            send(judge, action(2, ActionSource::Imagined, 0.2), at_ns(3));
+            for value in values {
+                hear(judge, &message(1));
+                send(judge, action(1, ActionSource::Policy, value), at_ns(3));
+            }
+        })
+    };
+    assert_eq!(answered([0.3, 0.3]), None);
+    assert_eq!(answered([0.3, 0.1]), Some("another answer"));
+}
+
+#[test]
+fn a_silence_is_believed_only_where_it_is_not_known_what_was_due() {
+    let fallbacks = |says_something_else: bool| {
+        after_one(setup(), |judge| {
+            let mut again = message(1);
+            again.published_ns += u64::from(says_something_else);
+            hear(judge, &again);
+            send(judge, action(2, ActionSource::Imagined, 0.1), at_ns(3));
+            send(judge, action(3, ActionSource::Fallback, 0.1), at_ns(4));
+            send(judge, action(4, ActionSource::Fallback, 0.1), at_ns(5));
+            let mut refused = message(5);
+            (refused.reward, refused.executed_action) = (f32::NAN, [0.1; ACTION_LEN]);
+            hear(judge, &refused);
+            send(judge, action(5, ActionSource::Fallback, 0.1), at_ns(5));
+        })
+    };
+    assert_eq!(fallbacks(false), Some("too many"));
+    assert_eq!(fallbacks(true), None);
+}
+
+#[test]
+fn a_silence_is_believed_where_the_newest_message_may_have_been_dropped() {
+    let refused = |sequence| {
+        let mut refused = message(sequence);
+        (refused.reward, refused.executed_action) = (f32::NAN, [0.1; ACTION_LEN]);
+        refused
+    };
+    let fallbacks_until = |newest| {
+        after_one(setup(), |judge| {
+            for sequence in [2, 3] {
+                hear(judge, &refused(sequence));
+                send(judge, action(sequence, ActionSource::Fallback, 0.1), at_ns(sequence));
+            }
+            // Stale by the time that number 7 comes.
+            hear(judge, &message(4));
+            hear(judge, &refused(newest));
+            send(judge, action(newest, ActionSource::Fallback, 0.1), at_ns(newest));
+        })
+    };
+    assert_eq!(fallbacks_until(5), Some("too many"));
+    assert_eq!(fallbacks_until(7), None);
+}
+
+#[test]
 fn a_message_that_is_not_answered_and_a_stand_in_that_does_not_come_are_seen() {
     let unanswered = after_one(setup(), |judge| {
         hear(judge, &message(2));
