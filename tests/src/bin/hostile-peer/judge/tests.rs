@@ -2,10 +2,12 @@
 
 use std::time::Duration;
 
-use rcwm_models::wire::Observation;
-use rcwm_runtime::controller::{SurpriseLimits, TickLimits};
+use rcwm_models::wire::{ActionSource, Observation};
+use rcwm_runtime::controller::{Fallback, SurpriseLimits, TickLimits};
 use rcwm_runtime::pacing::PacingSettings;
+use rcwm_runtime::policy::ActionLimits;
 
+use super::due::LOOKS_MAX;
 use super::*;
 
 const PERIOD_NS: u64 = 1_000_000;
