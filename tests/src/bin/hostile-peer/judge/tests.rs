@@ -135,6 +135,20 @@ fn a_fallback_is_the_one_that_was_asked_for() {
 }
 
 #[test]
+fn a_fallback_that_was_given_is_sent_as_far_as_the_limits_allow_even_where_no_position_is_known() {
+    let sent = |value| {
+        let setup = Setup { fallback: Fallback::Given([0.9; ACTION_LEN]), rate_max: Some(0.1), ..setup() };
+        let mut judge = Judge::new(setup, Known { is_absolute: true, ..known(LIMITS) }, Vec::new());
+        let mut refused = message(1);
+        refused.executed_action = [3e38; ACTION_LEN];
+        hear(&mut judge, &refused);
+        send(&mut judge, action(1, ActionSource::Fallback, value), at_ns(1));
+        judge.violation.map(|violation| violation.kind)
+    };
+    assert_eq!((sent(0.5), sent(0.4)), (None, Some("fallback")));
+}
+
+#[test]
 fn an_answer_to_anything_but_the_newest_message_is_stale() {
     let stale = after_one(setup(), |judge| {
         hear(judge, &message(3));

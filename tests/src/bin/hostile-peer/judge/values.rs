@@ -64,7 +64,10 @@ impl Judge {
         let same = |limits: &ActionLimits, base: &Vector| {
             (0..ACTION_LEN).all(|i| near(made(limits, base, i), action.action[i]))
         };
-        let any = |running: &Known| self.bases.iter().any(|base| same(&running.limits, base));
+        // Where the robot stands may not be known, and then does not count.
+        let nowhere = [*target];
+        let bases = if self.is_free && self.bases.is_empty() { &nowhere } else { self.bases.as_slice() };
+        let any = |running: &Known| bases.iter().any(|base| same(&running.limits, base));
         self.running.iter().any(any)
     }
 
