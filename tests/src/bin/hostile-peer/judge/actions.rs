@@ -81,9 +81,12 @@ impl Judge {
             if source == ActionSource::Policy {
                 self.count(source);
             }
+            let may_change = newest.swapped || newest.stand_ins > 0;
             let same = first.source == action.source
-                && (first.action == action.action || newest.swapped || newest.stand_ins > 0);
-            if !same {
+                && (first.action == action.action || may_change && self.is_made_of(action, &first.action));
+            if newest.stood_in_for {
+                self.unsent += 1;
+            } else if !same {
                 self.object("another answer", || format!("{action:?} after {first:?} to the same message"));
             }
             if newest.stand_ins > 0 {
@@ -92,6 +95,7 @@ impl Judge {
             }
             // Where it has changed, it is this one that is given from here on.
             (newest.answer, newest.swapped) = (Some(*action), self.running.len() > 1);
+            newest.stood_in_for &= source == ActionSource::Fallback;
             self.newest = Some(newest);
             return;
         }
@@ -109,7 +113,7 @@ impl Judge {
             self.object("overtaken", || format!("{action:?} answers {heard:?}, while {other:?} waits"));
         }
         let surprise = &self.setup.surprise;
-        let unfit = !heard.is_finite || !heard.is_executable();
+        let unfit = !heard.is_fit();
         let is_sound = self.running.iter().all(|running| running.is_sound);
         let may_fail = !is_sound || surprise.robot_max.is_some() || surprise.environment_max.is_some();
         let marked = match source {
@@ -122,8 +126,11 @@ impl Judge {
             self.object("marked", || format!("{action:?} answers {heard:?}"));
         }
         self.count(source);
-        newest.answer = Some(*action);
-        newest.swapped = false;
+        (newest.answer, newest.swapped) = (Some(*action), self.running.len() > 1);
+        if newest.borderline && source == ActionSource::Fallback {
+            // Its own answer, or the stand-in for it where it had turned stale: then what is due is the one before's.
+            (newest.follows, newest.unclear, newest.stood_in_for) = (false, true, true);
+        }
         self.newest = Some(newest);
     }
 

@@ -31,11 +31,11 @@ impl Judge {
         let left = self.imagined + self.unsent < u64::from(imagined_max) && self.fallbacks == 0
             || self.fallbacks + self.unsent < u64::from(fallbacks_max);
         self.due.is_due |= left && !self.may_withhold();
-        if !left {
-            // It has fallen silent, for certain where all of them were sent.
+        if !left && self.fallbacks >= u64::from(fallbacks_max) {
+            // It falls silent, for certain as all of them were sent.
             self.silent = true;
             if let Some(newest) = &mut self.newest {
-                newest.exhausted = self.fallbacks >= u64::from(fallbacks_max);
+                newest.exhausted = true;
             }
         }
     }

@@ -48,6 +48,11 @@ impl Heard {
         self.executed.iter().all(|x| x.abs() <= EXECUTED_MAX)
     }
 
+    /// Whether the policy can be asked about it.
+    pub(super) fn is_fit(&self) -> bool {
+        self.is_finite && self.is_executable()
+    }
+
     pub(super) fn is_stale_at(&self, now_ns: u64, stale_periods: f64) -> bool {
         let longest = (self.period_ns.max(PERIOD_NS_MIN) as f64 * stale_periods) as u64;
         self.period_ns > 0 && now_ns.saturating_sub(self.scheduled_ns) > longest

@@ -41,6 +41,10 @@ impl Judge {
             self.in_episode = false;
         }
         self.begins_anew();
+        if polled && self.newest.is_some_and(|newest| newest.answer.is_none() && newest.heard.is_fit()) {
+            // The policy has decided on the one before, and was overtaken: it was fit, as far as that is known here.
+            self.may_have_begun_anew();
+        }
         let says_nothing =
             heard.flags.contains(ObservationFlags::FIRST) && heard.executed == [0.0; ACTION_LEN];
         self.is_held |= heard.is_executable() && !says_nothing;
@@ -54,6 +58,7 @@ impl Judge {
             swapped: false,
             follows,
             unclear: false,
+            stood_in_for: false,
             executed_again: None,
             exhausted: false,
         });
@@ -73,11 +78,19 @@ impl Judge {
         let used_up = self.fallbacks + self.unsent >= u64::from(self.setup.ticks.fallback_ticks_max);
         if std::mem::take(&mut self.silent) {
             (self.imagined, self.fallbacks, self.unsent) = (0, 0, 0);
-        } else if used_up && self.newest.is_some_and(|newest| newest.unclear || newest.may_be_dropped()) {
-            // Where it is not known what was due, neither is whether it has fallen silent.
-            self.unsent += self.imagined + self.fallbacks;
-            (self.imagined, self.fallbacks) = (0, 0);
+        } else if used_up
+            && (self.unsent > 0
+                || self.newest.is_some_and(|newest| newest.unclear || newest.may_be_dropped()))
+        {
+            // Where it is not known what was due or counted, neither is whether it has fallen silent.
+            self.may_have_begun_anew();
         }
+    }
+
+    /// It counts from none, or goes on from what was sent.
+    fn may_have_begun_anew(&mut self) {
+        self.unsent += self.imagined + self.fallbacks;
+        (self.imagined, self.fallbacks) = (0, 0);
     }
 
     fn received_again(&mut self, heard: &Heard) {

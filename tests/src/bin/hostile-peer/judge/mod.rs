@@ -50,6 +50,8 @@ struct Newest {
     follows: bool,
     /// It came again and said something else, so that it is not known what is due.
     unclear: bool,
+    /// It may have turned stale, and what was sent be the stand-in for it.
+    stood_in_for: bool,
     /// What was executed, as it said when it came again.
     executed_again: Option<Vector>,
     /// No stand-in may come any more.
@@ -87,9 +89,10 @@ pub(crate) struct Judge {
     /// Stand-ins and fallbacks since the policy's last answer.
     imagined: u64,
     fallbacks: u64,
-    /// Messages since then that were found in the middle of a tick: as many ticks may have been counted and not sent.
+    /// So many more may have been counted: those of messages that were found in the middle of a tick, which is not sent then, and those
+    /// before what may have been a new beginning.
     unsent: u64,
-    /// The controller may have fallen silent since, and begins anew with the next message.
+    /// The controller has fallen silent since, and begins anew with the next message.
     silent: bool,
     due: Due,
     /// The controller's last two looks at its clock.

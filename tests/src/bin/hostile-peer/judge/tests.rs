@@ -200,16 +200,19 @@ fn each_of_those_that_may_have_turned_stale_may_be_the_one_that_is_answered() {
 #[test]
 fn a_message_that_comes_again_is_answered_as_it_was_last() {
     let answered = |values: [f32; 2]| {
-        after_one(setup(), |judge| {
+        after_one(Setup { rate_max: Some(0.1), ..setup() }, |judge| {
             send(judge, action(2, ActionSource::Imagined, 0.2), at_ns(3));
+            let mut again = message(1);
+            again.executed_action = [0.4; ACTION_LEN];
             for value in values {
-                hear(judge, &message(1));
+                hear(judge, &again);
                 send(judge, action(1, ActionSource::Policy, value), at_ns(3));
             }
         })
     };
-    assert_eq!(answered([0.3, 0.3]), None);
+    assert_eq!(answered([0.3, 0.3]), None, "as near to the first answer as it may be");
     assert_eq!(answered([0.3, 0.1]), Some("another answer"));
+    assert_eq!(answered([0.25, 0.25]), Some("another answer"));
 }
 
 #[test]
@@ -233,13 +236,13 @@ fn a_silence_is_believed_only_where_it_is_not_known_what_was_due() {
 }
 
 #[test]
-fn a_silence_is_believed_where_the_newest_message_may_have_been_dropped() {
+fn a_new_beginning_is_believed_where_a_message_may_have_been_dropped_or_decided_on() {
     let refused = |sequence| {
         let mut refused = message(sequence);
         (refused.reward, refused.executed_action) = (f32::NAN, [0.1; ACTION_LEN]);
         refused
     };
-    let fallbacks_until = |newest| {
+    let fallbacks_until = |newest, polled| {
         after_one(setup(), |judge| {
             for sequence in [2, 3] {
                 hear(judge, &refused(sequence));
@@ -247,12 +250,33 @@ fn a_silence_is_believed_where_the_newest_message_may_have_been_dropped() {
             }
             // Stale by the time that number 7 comes.
             hear(judge, &message(4));
-            hear(judge, &refused(newest));
+            judge.received(Heard::new(1, &refused(newest), at_ns(newest)), polled);
             send(judge, action(newest, ActionSource::Fallback, 0.1), at_ns(newest));
         })
     };
-    assert_eq!(fallbacks_until(5), Some("too many"));
-    assert_eq!(fallbacks_until(7), None);
+    assert_eq!(fallbacks_until(5, false), Some("too many"));
+    assert_eq!(fallbacks_until(5, true), None, "overtaken");
+    assert_eq!(fallbacks_until(7, false), None, "stale");
+}
+
+#[test]
+fn a_fallback_may_stand_in_for_a_message_that_has_turned_stale_and_its_answer_come_later() {
+    let answered = |stale_at_ns, values: [f32; 2]| {
+        after_one(setup(), |judge| {
+            hear(judge, &message(4));
+            judge.looks_at_link(stale_at_ns, false);
+            send(judge, action(4, ActionSource::Fallback, 0.1), stale_at_ns);
+            let mut again = message(4);
+            (again.scheduled_ns, again.published_ns) = (at_ns(7), at_ns(7));
+            for value in values {
+                judge.received(Heard::new(1, &again, at_ns(7)), false);
+                send(judge, action(4, ActionSource::Policy, value), at_ns(7));
+            }
+        })
+    };
+    assert_eq!(answered(at_ns(7), [0.2, 0.2]), None);
+    assert_eq!(answered(at_ns(7), [0.2, 0.3]), Some("another answer"));
+    assert_eq!(answered(at_ns(5), [0.2, 0.2]), Some("marked"));
 }
 
 #[test]

@@ -47,7 +47,7 @@ impl Judge {
     }
 
     /// Whether an action is what the filter makes of a target, from any base.
-    fn is_made_of(&self, action: &Action, target: &Vector) -> bool {
+    pub(super) fn is_made_of(&self, action: &Action, target: &Vector) -> bool {
         let made = |limits: &ActionLimits, base: &Vector, i: usize| {
             let wanted = target[i].clamp(limits.low[i], limits.high[i]);
             let Some(rate_max) = self.setup.rate_max.filter(|_| !self.is_free) else { return wanted };
