@@ -4,12 +4,20 @@
 
 mod support;
 
+use std::cell::Cell;
+use std::sync::Arc;
+use std::sync::atomic::{AtomicBool, Ordering};
 use std::time::Duration;
 
 use rcwm_models::bundle::PartName;
-use rcwm_models::wire::{Action, ActionSource, ObservationFlags, SimulatorLink, Wait};
-use rcwm_runtime::controller::{Cause, ControllerError, Ended, Fallback, State, SurpriseLimits, TickLimits};
-use rcwm_runtime::{EngineSettings, Policy};
+use rcwm_models::wire::{
+    Action, ActionSource, ControllerLink, LinkError, ObservationFlags, ObservationSample, SimulatorLink, Wait,
+};
+use rcwm_runtime::controller::{
+    Cause, Controller, ControllerError, ControllerSettings, Ended, Fallback, State, SurpriseLimits,
+    TickLimits, Transport,
+};
+use rcwm_runtime::{EngineKind, EngineSettings, Policy};
 use support::{
     NEVER, PERIOD_NS, ask, dividing_by_zero, due_now, image, observation, own_link, smallest_bundle,
     start_controller_with,
@@ -138,6 +146,77 @@ fn an_answer_that_the_robot_is_too_far_from_by_now_is_the_same_whenever_it_is_as
     assert_eq!((again(), again()), (second, second));
     peer.close().unwrap();
     controller.join().unwrap().0.unwrap();
+}
+
+/// A link on which the peer says once more where it stands, just before a stand-in would be sent, and does so a few times.
+struct JustInTime {
+    link: ControllerLink,
+    peer: SimulatorLink,
+    times: Cell<u64>,
+    /// The controller has just looked and found nothing: when it looks again it has something to send.
+    found_nothing: Cell<bool>,
+    stop: Arc<AtomicBool>,
+}
+
+impl JustInTime {
+    const TIMES: u64 = 3;
+}
+
+impl Transport for JustInTime {
+    fn now_ns(&self) -> u64 {
+        Transport::now_ns(&self.link)
+    }
+
+    fn wait(&self, spin: Duration, timeout: Duration) -> Result<Wait<ObservationSample>, LinkError> {
+        self.found_nothing.set(false);
+        Transport::wait(&self.link, spin, timeout)
+    }
+
+    fn poll(&self) -> Result<Option<ObservationSample>, LinkError> {
+        if self.found_nothing.get() {
+            let mut again = due_now(0);
+            again.flags |= ObservationFlags::REPEATED.0;
+            self.peer.publish(|slot| *slot = again)?;
+            self.times.update(|times| times + 1);
+            self.stop.store(self.times.get() > Self::TIMES, Ordering::Relaxed);
+        }
+        let found = Transport::poll(&self.link)?;
+        self.found_nothing.set(found.is_none());
+        Ok(found)
+    }
+
+    fn send(&self, action: Action) -> Result<u64, LinkError> {
+        Transport::send(&self.link, action)
+    }
+
+    fn hello(&self) -> Result<(), LinkError> {
+        Transport::hello(&self.link)
+    }
+
+    fn clean_up_dead_peers(&self) {
+        Transport::clean_up_dead_peers(&self.link);
+    }
+
+    fn say_closed(&self) -> Result<(), LinkError> {
+        Transport::say_closed(&self.link)
+    }
+}
+
+#[test]
+fn a_peer_that_says_where_it_stands_before_a_stand_in_is_sent_is_gone_back_to_as_well() {
+    let own = own_link();
+    let stop = Arc::<AtomicBool>::default();
+    let link = ControllerLink::open(own.0.clone()).unwrap();
+    let (peer, found_nothing) = (own.peer(), Cell::new(false));
+    peer.publish(|slot| *slot = due_now(0)).unwrap();
+    let stage = JustInTime { link, peer, times: Cell::new(0), found_nothing, stop: Arc::clone(&stop) };
+    let policy = Policy::load(&smallest_bundle(), EngineSettings::tract()).unwrap();
+    let settings = ControllerSettings::new(own.0.clone());
+    let mut controller = Controller::on(Box::new(stage), policy, settings).unwrap();
+    let ended = controller.run(&stop, &mut []).unwrap();
+    let counters = controller.report(EngineKind::Tract, ended).counters;
+    assert_eq!((counters.answers, counters.imagined_answers), (1 + JustInTime::TIMES, 0), "{counters:?}");
+    assert_eq!(counters.late_observations, JustInTime::TIMES, "{counters:?}");
 }
 
 #[test]

@@ -74,8 +74,10 @@ impl Controller {
         if went_on && !observation.is(ObservationFlags::REPEATED) {
             return Ok(Taken::Nothing);
         }
+        // A tick may also have been imagined and its answer not been sent, as this observation was found meanwhile.
+        let rewound =
+            observation.is(ObservationFlags::REPEATED) && self.rewind(sequence.saturating_add(1), false);
         if went_on {
-            self.rewind(sequence.saturating_add(1), false);
             self.gate.observed(observation, false);
         }
         let source = ActionSource::from_wire(own.source).unwrap_or(ActionSource::Fallback);
@@ -91,7 +93,7 @@ impl Controller {
             // Where the gate has changed it, since the robot stands elsewhere by now, this is what is the same from here on.
             self.own_answer = Some(answer);
         }
-        if went_on {
+        if went_on || rewound {
             self.work_ahead((!observation.is(ObservationFlags::LAST)).then_some(&answer.action));
         }
         Ok(Taken::Again)
