@@ -7,10 +7,11 @@ mod support;
 use std::path::Path;
 use std::sync::atomic::{AtomicBool, Ordering};
 use std::thread::JoinHandle;
+use std::time::Duration;
 
 use rcwm_models::bundle::PartName;
 use rcwm_models::wire::{ActionSource, ObservationFlags, SimulatorLink};
-use rcwm_runtime::controller::{Controller, Fallback, RunReport};
+use rcwm_runtime::controller::{Controller, ControllerSettings, RunReport, TickLimits};
 use rcwm_runtime::policy::Sampling;
 use rcwm_runtime::swap::{Answer, SwapError, SwapSettings, Swapper, When, ask, name_of_server};
 use rcwm_runtime::{EngineKind, EngineSettings, Policy};
@@ -27,6 +28,10 @@ fn start(link: &OwnLink) -> JoinHandle<RunReport> {
 }
 
 fn start_on(link: &OwnLink, engine: EngineSettings) -> JoinHandle<RunReport> {
+    start_with_limits(link, engine, TickLimits::default())
+}
+
+fn start_with_limits(link: &OwnLink, engine: EngineSettings, ticks: TickLimits) -> JoinHandle<RunReport> {
     let policy = Policy::load(&smallest_bundle(), engine).unwrap();
     let settings = SwapSettings {
         link: link.0.clone(),
@@ -35,7 +40,8 @@ fn start_on(link: &OwnLink, engine: EngineSettings) -> JoinHandle<RunReport> {
         rate_hz: policy.manifest().control.rate_hz,
     };
     let swapper = Swapper::start(settings).unwrap();
-    support::start_with(policy, link, Fallback::Hold, move |controller: &mut Controller| {
+    let change = |settings: &mut ControllerSettings| settings.ticks = ticks;
+    support::start_changed(policy, link, change, move |controller: &mut Controller| {
         controller.take_swaps(swapper);
         let ended = controller.run(&AtomicBool::new(false), &mut []).unwrap();
         controller.report(EngineKind::Tract, ended)
@@ -128,6 +134,24 @@ fn a_bundle_taken_at_once_starts_from_its_initial_state_in_the_middle_of_an_epis
     }
     peer.close().unwrap();
     assert_eq!(controller.join().unwrap().counters.swaps, 1);
+}
+
+#[test]
+fn a_policy_that_has_seen_nothing_yet_is_stood_in_for_by_as_many_fallbacks_as_allowed() {
+    let link = own_link();
+    let peer = link.peer();
+    let ticks = TickLimits { imagined_ticks_max: 2, fallback_ticks_max: 3 };
+    let controller = start_with_limits(&link, EngineSettings::tract(), ticks);
+    support::ask(&peer, &support::observation(0, 0));
+    let answer = ask_aside(&link, &smallest_bundle(), When::Now).join().unwrap().unwrap();
+    assert!(matches!(answer, Answer::Taken { .. }), "{answer:?}");
+    // The same again, from which on the next ones are due, and do not come.
+    support::ask(&peer, &support::due_now(0));
+    std::thread::sleep(Duration::from_nanos(10 * support::PERIOD_NS));
+    peer.close().unwrap();
+    let counters = controller.join().unwrap().counters;
+    assert_eq!((counters.imagined_answers, counters.fallback_answers), (0, 3), "{counters:?}");
+    assert_eq!(counters.peers_lost, 1, "{counters:?}");
 }
 
 #[test]

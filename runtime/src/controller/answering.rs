@@ -220,12 +220,17 @@ impl Controller {
     ) -> Result<(), ControllerError> {
         let found_ns = self.link.now_ns();
         let Some(missing) = self.pacing.take_overdue(found_ns) else { return Ok(()) };
-        let (state, response) = step(self.state, Event::Overdue, self.settings.ticks);
+        // Where the policy has just taken over, it has seen nothing that it could go on from.
+        let held = self.gate.held().filter(|_| !self.fresh_policy);
+        let (mut state, mut response) = step(self.state, Event::Overdue, self.settings.ticks);
+        if response == Response::Imagine && held.is_none() {
+            (state, response) = step(self.state, Event::Unfit(Cause::Silence), self.settings.ticks);
+        }
         self.state = state;
-        let (decision, (source, action)) = match response {
-            Response::Imagine => self.imagine(missing.sequence)?,
-            Response::Fallback => (None, self.fallback()),
-            Response::Policy | Response::Nothing => {
+        let (decision, (source, action)) = match (response, held) {
+            (Response::Imagine, Some(held)) => self.imagine(missing.sequence, &held)?,
+            (Response::Imagine | Response::Fallback, _) => (None, self.fallback()),
+            (Response::Policy | Response::Nothing, _) => {
                 self.counters.peers_lost += 1;
                 self.pacing.rest();
                 return Ok(());
@@ -261,13 +266,13 @@ impl Controller {
     }
 
     /// The policy on an imagined frame; the fallback where that fails.
-    fn imagine(&mut self, sequence: u64) -> Result<(Option<Decision>, Chosen), ControllerError> {
-        // Where the policy has just taken over, it has seen nothing that it could go on from.
-        let Some(held) = self.gate.held().filter(|_| !self.fresh_policy) else {
-            return Ok((None, self.fallback()));
-        };
+    fn imagine(
+        &mut self,
+        sequence: u64,
+        held: &[f32; ACTION_LEN],
+    ) -> Result<(Option<Decision>, Chosen), ControllerError> {
         self.imagined.note(sequence, self.policy.state());
-        match self.policy.imagine(&held) {
+        match self.policy.imagine(held) {
             Ok(decision) => Ok((Some(decision), (ActionSource::Imagined, Some(decision.action)))),
             Err(error) => {
                 self.imagined.take_back();
