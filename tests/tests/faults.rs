@@ -11,10 +11,10 @@ const PERIOD: Duration = Duration::from_millis(50);
 /// `fault-table` runs fifty.
 const ROUNDS: usize = 2;
 
-/// Runs an experiment; nothing stale or unfit was on the wire, and nothing is left.
+/// Runs an experiment; nothing stale or invalid was on the wire, and nothing is left.
 fn sound(experiment: Experiment, rounds: usize) -> Outcome {
     let outcome = experiment.run(rounds, PERIOD);
-    assert!(outcome.verdict.unfit == 0 && outcome.verdict.stale.is_empty(), "{outcome:?}");
+    assert!(outcome.verdict.invalid == 0 && outcome.verdict.stale.is_empty(), "{outcome:?}");
     assert_eq!(outcome.leftovers, Vec::<String>::new());
     assert_eq!(outcome.rounds, rounds);
     outcome
@@ -208,7 +208,7 @@ fn a_policy_that_is_unfit_for_too_long_ends_the_run_with_its_own_exit_code() {
     let poisoned = poisoned_bundle();
     let bed = Bed::new(PERIOD);
     let bundle = poisoned.path().to_path_buf();
-    // Half of all ticks are unfit: the first of them is one too many.
+    // Half of all ticks are invalid: the first of them is one too many.
     let mut controller = bed.start_controller(&ControllerOptions {
         bundle,
         fallback_ticks_max: 0,

@@ -6,7 +6,7 @@
 //! | 1 | an error: one line on stderr says which, and what to do; or a bundle that does not verify, a replay that differs |
 //! | 2 | the command line was not understood |
 //! | 3 | no observation came within --timeout |
-//! | 4 | stopped: the policy was unfit for --fallback-ticks-max ticks |
+//! | 4 | stopped: the policy gave nothing valid for --fallback-ticks-max ticks |
 //! | 5 | the peer was silent for --silence-max |
 //! | 130 | ended at once by a second Ctrl-C |
 
@@ -47,7 +47,7 @@ enum Exit {
     Error = 1,
     /// No observation came within --timeout.
     NoObservation = 3,
-    /// The policy was unfit for --fallback-ticks-max ticks.
+    /// The policy gave nothing valid for --fallback-ticks-max ticks.
     Stopped = 4,
     /// The peer was silent for --silence-max.
     PeerLost = 5,
@@ -85,7 +85,7 @@ Examples:
 
 Exit codes:
   0 done (also after Ctrl-C), 1 error or not verified, 2 usage, 3 no observation within --timeout, 4 stopped: the policy
-  was unfit for --fallback-ticks-max ticks, 5 the peer was silent for --silence-max, 130 second Ctrl-C
+  gave nothing valid for --fallback-ticks-max ticks, 5 the peer was silent for --silence-max, 130 second Ctrl-C
 
 Environment:
   ORT_DYLIB_PATH  ONNX Runtime's library, for --engine ort (PyPI onnxruntime: capi/libonnxruntime.so.1.31.1)

@@ -30,8 +30,8 @@ use crate::swap::{SwapSettings, Swapper};
     Ends when the simulator says that it closes, after --episodes, or on Ctrl-C. A simulator that dies is waited for:\n\
     the run goes on with the next one on the instance. docs/controller.md draws what happens when.\n\n\
     Exit codes:\n  \
-    0 done (also after Ctrl-C), 1 error, 2 usage, 3 no observation within --timeout, 4 stopped: the policy was unfit\n  \
-    for --fallback-ticks-max ticks, 5 the peer was silent for --silence-max, 130 second Ctrl-C")]
+    0 done (also after Ctrl-C), 1 error, 2 usage, 3 no observation within --timeout, 4 stopped: the policy gave\n  \
+    nothing valid for --fallback-ticks-max ticks, 5 the peer was silent for --silence-max, 130 second Ctrl-C")]
 pub(super) struct RunArguments {
     /// The bundle's folder
     #[arg(long, value_name = "DIR")]

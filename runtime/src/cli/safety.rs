@@ -26,7 +26,7 @@ pub(super) struct SafetyArguments {
     /// Missing observations in a row that the world model imagines before the fallback (real time)
     #[arg(long, value_name = "N", default_value_t = TickLimits::default().imagined_ticks_max)]
     imagined_ticks_max: u32,
-    /// Fallback actions in a row; then silence where nobody is there, and the end of the run where the policy is unfit
+    /// Fallback actions in a row; then silence where nobody is there, and the end of the run where the policy gives nothing valid
     #[arg(long, value_name = "N", default_value_t = TickLimits::default().fallback_ticks_max)]
     fallback_ticks_max: u32,
     /// An observation is missing when it is so many periods late (real time)

@@ -50,7 +50,7 @@ pub enum ControllerError {
          `rcwm-runtime verify`, or allow more with --fallback-ticks-max"
     )]
     Stopped {
-        /// Why the policy was unfit.
+        /// Why the policy gave nothing valid.
         cause: Cause,
         /// The limit.
         ticks: u32,
@@ -69,7 +69,7 @@ pub enum Ended {
     Interrupted,
     /// The peer was silent for too long.
     PeerLost,
-    /// The policy was unfit for too long.
+    /// The policy gave nothing valid for too long.
     Stopped,
     /// Another error ended it.
     Failed,

@@ -13,7 +13,7 @@ pub enum State {
     #[default]
     Waiting,
     /// Observations come and the policy answers them.
-    Following,
+    Tracking,
     /// Observations are missing, and the policy answers what the world model imagines.
     Imagining {
         /// Imagined ticks in a row.
@@ -26,7 +26,7 @@ pub enum State {
         /// Why, as of the last of them.
         cause: Cause,
     },
-    /// The policy was unfit for too long. Sends nothing any more; the run ends.
+    /// The policy gave nothing valid for too long. Sends nothing any more; the run ends.
     Stopped {
         /// Why.
         cause: Cause,
@@ -70,7 +70,7 @@ pub enum Event {
     /// A new observation came and the policy decided on it, within all limits.
     Decided,
     /// A new observation came, or one was to be imagined, and there is nothing fit to send.
-    Unfit(Cause),
+    Invalid(Cause),
     /// An observation is overdue (real time only).
     Overdue,
     /// The peer has said that it leaves.
@@ -82,7 +82,7 @@ pub enum Event {
 pub enum Response {
     /// The policy's action.
     Policy,
-    /// The policy's action on an imagined frame. Where imagining fails, [`Event::Unfit`] follows.
+    /// The policy's action on an imagined frame. Where imagining fails, [`Event::Invalid`] follows.
     Imagine,
     /// The fallback action.
     Fallback,
@@ -95,7 +95,7 @@ pub enum Response {
 pub struct TickLimits {
     /// Imagined ticks in a row before the fallback.
     pub imagined_ticks_max: u32,
-    /// Fallback ticks in a row before the controller falls silent (nobody there) or stops (policy unfit).
+    /// Fallback ticks in a row before the controller falls silent (nobody there) or stops (policy invalid).
     pub fallback_ticks_max: u32,
 }
 
@@ -111,13 +111,13 @@ pub fn step(state: State, event: Event, limits: TickLimits) -> (State, Response)
     match (state, event) {
         (State::Stopped { .. }, _) => (state, Response::Nothing),
         (_, Event::Left) => (State::Waiting, Response::Nothing),
-        (_, Event::Decided) => (State::Following, Response::Policy),
+        (_, Event::Decided) => (State::Tracking, Response::Policy),
         (State::Waiting, Event::Overdue) => (state, Response::Nothing),
-        (State::Following, Event::Overdue) => imagine(0, limits),
+        (State::Tracking, Event::Overdue) => imagine(0, limits),
         (State::Imagining { ticks }, Event::Overdue) => imagine(ticks, limits),
         (State::Fallback { ticks, .. }, Event::Overdue) => fall_back(ticks, Cause::Silence, limits),
-        (State::Fallback { ticks, .. }, Event::Unfit(cause)) => fall_back(ticks, cause, limits),
-        (_, Event::Unfit(cause)) => fall_back(0, cause, limits),
+        (State::Fallback { ticks, .. }, Event::Invalid(cause)) => fall_back(ticks, cause, limits),
+        (_, Event::Invalid(cause)) => fall_back(0, cause, limits),
     }
 }
 
@@ -145,7 +145,7 @@ mod tests {
     use super::*;
 
     const LIMITS: TickLimits = TickLimits { imagined_ticks_max: 2, fallback_ticks_max: 3 };
-    const UNFIT: [Cause; 5] =
+    const INVALID: [Cause; 5] =
         [Cause::Observation, Cause::Output, Cause::Engine, Cause::RobotSurprise, Cause::EnvironmentSurprise];
 
     fn imagining(ticks: u32) -> State {
@@ -157,8 +157,8 @@ mod tests {
     }
 
     fn all_states() -> Vec<State> {
-        let mut states = vec![State::Waiting, State::Following, imagining(1), imagining(2)];
-        for cause in UNFIT.into_iter().chain([Cause::Silence]) {
+        let mut states = vec![State::Waiting, State::Tracking, imagining(1), imagining(2)];
+        for cause in INVALID.into_iter().chain([Cause::Silence]) {
             states.extend((1..=3).map(|ticks| fallback(ticks, cause)));
             states.push(State::Stopped { cause });
         }
@@ -168,30 +168,30 @@ mod tests {
     /// Every arrow of the drawing in `docs/controller.md`, once.
     #[test]
     fn every_transition_is_the_drawn_one() {
-        use Event::{Decided, Left, Overdue, Unfit};
-        use State::{Following, Stopped, Waiting};
+        use Event::{Decided, Invalid, Left, Overdue};
+        use State::{Stopped, Tracking, Waiting};
         let (output, silence) = (Cause::Output, Cause::Silence);
         let table = [
-            (Waiting, Decided, Following, Response::Policy),
-            (Waiting, Unfit(output), fallback(1, output), Response::Fallback),
+            (Waiting, Decided, Tracking, Response::Policy),
+            (Waiting, Invalid(output), fallback(1, output), Response::Fallback),
             (Waiting, Overdue, Waiting, Response::Nothing),
             (Waiting, Left, Waiting, Response::Nothing),
-            (Following, Decided, Following, Response::Policy),
-            (Following, Unfit(output), fallback(1, output), Response::Fallback),
-            (Following, Overdue, imagining(1), Response::Imagine),
-            (Following, Left, Waiting, Response::Nothing),
-            (imagining(1), Decided, Following, Response::Policy),
-            (imagining(1), Unfit(output), fallback(1, output), Response::Fallback),
+            (Tracking, Decided, Tracking, Response::Policy),
+            (Tracking, Invalid(output), fallback(1, output), Response::Fallback),
+            (Tracking, Overdue, imagining(1), Response::Imagine),
+            (Tracking, Left, Waiting, Response::Nothing),
+            (imagining(1), Decided, Tracking, Response::Policy),
+            (imagining(1), Invalid(output), fallback(1, output), Response::Fallback),
             (imagining(1), Overdue, imagining(2), Response::Imagine),
             (imagining(2), Overdue, fallback(1, silence), Response::Fallback),
             (imagining(2), Left, Waiting, Response::Nothing),
-            (fallback(1, output), Decided, Following, Response::Policy),
-            (fallback(3, silence), Decided, Following, Response::Policy),
+            (fallback(1, output), Decided, Tracking, Response::Policy),
+            (fallback(3, silence), Decided, Tracking, Response::Policy),
             (fallback(1, silence), Overdue, fallback(2, silence), Response::Fallback),
             (fallback(1, output), Overdue, fallback(2, silence), Response::Fallback),
-            (fallback(1, silence), Unfit(output), fallback(2, output), Response::Fallback),
+            (fallback(1, silence), Invalid(output), fallback(2, output), Response::Fallback),
             (fallback(3, silence), Overdue, Waiting, Response::Nothing),
-            (fallback(3, output), Unfit(output), Stopped { cause: output }, Response::Nothing),
+            (fallback(3, output), Invalid(output), Stopped { cause: output }, Response::Nothing),
             (fallback(2, output), Left, Waiting, Response::Nothing),
             (Stopped { cause: output }, Decided, Stopped { cause: output }, Response::Nothing),
             (Stopped { cause: output }, Left, Stopped { cause: output }, Response::Nothing),
@@ -204,16 +204,16 @@ mod tests {
     #[test]
     fn a_policy_s_action_is_sent_on_its_decision_only_and_leads_to_following() {
         for state in all_states() {
-            for event in [Event::Overdue, Event::Left].into_iter().chain(UNFIT.map(Event::Unfit)) {
+            for event in [Event::Overdue, Event::Left].into_iter().chain(INVALID.map(Event::Invalid)) {
                 let (next, response) = step(state, event, LIMITS);
-                assert!(response != Response::Policy && next != State::Following, "{state:?}, {event:?}");
+                assert!(response != Response::Policy && next != State::Tracking, "{state:?}, {event:?}");
             }
         }
     }
 
     #[test]
     fn silence_is_borne_for_so_many_ticks_and_no_more() {
-        let (mut state, mut sent) = (State::Following, Vec::new());
+        let (mut state, mut sent) = (State::Tracking, Vec::new());
         for _ in 0..10 {
             let (next, response) = step(state, Event::Overdue, LIMITS);
             state = next;
@@ -226,11 +226,11 @@ mod tests {
     }
 
     #[test]
-    fn every_unfitness_that_lasts_stops_the_controller() {
-        for cause in UNFIT {
-            let mut state = State::Following;
+    fn every_invalidity_that_lasts_stops_the_controller() {
+        for cause in INVALID {
+            let mut state = State::Tracking;
             for _ in 0..=LIMITS.fallback_ticks_max {
-                state = step(state, Event::Unfit(cause), LIMITS).0;
+                state = step(state, Event::Invalid(cause), LIMITS).0;
             }
             assert_eq!(state, State::Stopped { cause });
         }
@@ -241,9 +241,9 @@ mod tests {
         let none = TickLimits { imagined_ticks_max: 0, fallback_ticks_max: 0 };
         let no_imagining = TickLimits { imagined_ticks_max: 0, ..LIMITS };
         let silent = (fallback(1, Cause::Silence), Response::Fallback);
-        assert_eq!(step(State::Following, Event::Overdue, no_imagining), silent);
-        assert_eq!(step(State::Following, Event::Overdue, none), (State::Waiting, Response::Nothing));
+        assert_eq!(step(State::Tracking, Event::Overdue, no_imagining), silent);
+        assert_eq!(step(State::Tracking, Event::Overdue, none), (State::Waiting, Response::Nothing));
         let stopped = State::Stopped { cause: Cause::Engine };
-        assert_eq!(step(State::Following, Event::Unfit(Cause::Engine), none), (stopped, Response::Nothing));
+        assert_eq!(step(State::Tracking, Event::Invalid(Cause::Engine), none), (stopped, Response::Nothing));
     }
 }

@@ -1,10 +1,10 @@
-//! The loop over shared memory: every observation is answered once, and nothing unfit reaches the wire.
+//! The loop over shared memory: every observation is answered once, and nothing invalid reaches the wire.
 //!
 //! **What is answered how.** A new observation gets the policy's action. A repeated one (a simulator asks again) gets the same
 //! answer without a second tick. A stale one is dropped. In real time one that is missing is answered by what the world model
 //! imagines, and after some of those by the fallback action. One that holds numbers that are not finite, and one on which the
 //! policy fails, gives such numbers, or is more surprised than allowed, gets the fallback action. [`step`] is all of that as one
-//! pure function; `docs/controller.md` draws it. Everything that is sent passes one gate that refuses what is not
+//! pure function; `docs/controller.md` draws it. Everything that is sent passes one safety filter that refuses what is not
 //! finite and enforces the limits. All of it is counted.
 //!
 //! **What the policy's state follows.** The state starts anew at the first observation of an episode, and where the controller
@@ -12,25 +12,25 @@
 //! back to before it was imagined. Observations that were lost while nobody looked are counted; the state goes on, and the next
 //! image corrects it.
 
-mod answering;
 mod ended;
 mod episodes;
-mod gate;
 mod guard;
 mod imagined;
 mod machine;
 mod report;
+mod safety_filter;
 mod sequence;
 mod surprise;
 mod tick;
+mod tick_handler;
 mod times;
 mod transport;
 
 pub use ended::{ControllerError, Ended};
 pub use episodes::{EPISODES_KEPT, Episodes};
-pub use gate::{Fallback, Gate, Passed};
 pub use machine::{Cause, Event, Response, State, TickLimits, step};
 pub use report::{Counters, EpisodeResult, Pace, RunReport};
+pub use safety_filter::{Fallback, Passed, SafetyFilter};
 pub use sequence::{Arrival, SequenceTracker};
 pub use surprise::{BranchSurprise, SurpriseLimits, SurpriseReport};
 pub use tick::{Tick, TickObserver, TickTimes};
@@ -106,7 +106,7 @@ pub struct Controller {
     state: State,
     tracker: SequenceTracker,
     pacing: Pacing,
-    gate: Gate,
+    filter: SafetyFilter,
     telemetry: Telemetry,
     surprise: SurpriseTelemetry,
     counters: Counters,
@@ -154,9 +154,9 @@ impl Controller {
     /// [`ControllerError::Link`], or [`ControllerError::ZeroIsAPose`].
     pub fn open(policy: Policy, settings: ControllerSettings) -> Result<Self, ControllerError> {
         // What is wrong with the settings is said before anybody is connected to.
-        let gate = gate(&policy, &settings)?;
+        let filter = safety_filter(&policy, &settings)?;
         let link = ControllerLink::open(settings.link.clone())?;
-        Ok(Self::with(Box::new(link), gate, policy, settings))
+        Ok(Self::with(Box::new(link), filter, policy, settings))
     }
 
     /// A controller on a transport that is open.
@@ -168,17 +168,22 @@ impl Controller {
         policy: Policy,
         settings: ControllerSettings,
     ) -> Result<Self, ControllerError> {
-        let gate = gate(&policy, &settings)?;
-        Ok(Self::with(link, gate, policy, settings))
+        let filter = safety_filter(&policy, &settings)?;
+        Ok(Self::with(link, filter, policy, settings))
     }
 
-    fn with(link: Box<dyn Transport>, gate: Gate, policy: Policy, settings: ControllerSettings) -> Self {
+    fn with(
+        link: Box<dyn Transport>,
+        filter: SafetyFilter,
+        policy: Policy,
+        settings: ControllerSettings,
+    ) -> Self {
         Self {
             link,
             state: State::default(),
             tracker: SequenceTracker::default(),
             pacing: Pacing::new(settings.pacing),
-            gate,
+            filter,
             telemetry: Telemetry::new(),
             surprise: SurpriseTelemetry::new(),
             counters: Counters::default(),
@@ -208,7 +213,7 @@ impl Controller {
         if let Some(swapper) = &self.swapper
             && swapper.poll(moment, &mut self.policy)
         {
-            self.gate.take_limits(&self.policy.manifest().control);
+            self.filter.take_limits(&self.policy.manifest().control);
             self.imagined.clear();
             self.fresh_policy = true;
             self.counters.swaps += 1;
@@ -218,7 +223,7 @@ impl Controller {
     /// Nothing came: time for what need not be done in a tick.
     fn idle(&mut self, heard_ns: u64, asked_ns: &mut u64) -> Result<(), ControllerError> {
         self.swap(if self.running.is_some() { Moment::InEpisode } else { Moment::BetweenEpisodes });
-        self.bear_silence(heard_ns)?;
+        self.check_timeout(heard_ns)?;
         self.ask_again(heard_ns, asked_ns)
     }
 
@@ -254,7 +259,7 @@ impl Controller {
                 Brought::Nothing => Taken::Nothing,
                 Brought::Overdue => {
                     self.looked = false;
-                    self.go_without(observers)?;
+                    self.handle_missing(observers)?;
                     Taken::Nothing
                 }
                 Brought::Closed if !self.settings.stay => return Ok(Ended::SimulatorClosed),
@@ -331,7 +336,7 @@ impl Controller {
     }
 
     /// Ends the run when nobody has been there for too long.
-    fn bear_silence(&self, heard_ns: u64) -> Result<(), ControllerError> {
+    fn check_timeout(&self, heard_ns: u64) -> Result<(), ControllerError> {
         let instance = || self.settings.link.instance.clone();
         let over = |max: Option<Duration>| max.filter(|max| self.since(heard_ns) >= *max);
         if self.counters.observations == 0 {
@@ -404,11 +409,11 @@ impl Controller {
     }
 }
 
-/// The gate of a policy under these settings.
-fn gate(policy: &Policy, settings: &ControllerSettings) -> Result<Gate, ControllerError> {
+/// The safety filter of a policy under these settings.
+fn safety_filter(policy: &Policy, settings: &ControllerSettings) -> Result<SafetyFilter, ControllerError> {
     let control = &policy.manifest().control;
     if settings.fallback == Fallback::Zero && control.action_mode == ActionMode::Absolute {
         return Err(ControllerError::ZeroIsAPose);
     }
-    Ok(Gate::new(control, settings.rate_max))
+    Ok(SafetyFilter::new(control, settings.rate_max))
 }

@@ -27,7 +27,7 @@ pub struct Tick<'a> {
     pub is_first: bool,
     /// The state went back to before this tick was imagined, because its observation came after all.
     pub rewound: bool,
-    /// What the policy decided, on the observation or on an imagined frame; none where it was unfit or not asked.
+    /// What the policy decided, on the observation or on an imagined frame; none where it was invalid or not asked.
     pub decision: Option<Decision>,
     /// What was sent.
     pub answer: Action,

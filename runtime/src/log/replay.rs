@@ -12,7 +12,7 @@ use super::LogError;
 use super::reader::{Entry, LogReader, LoggedTick};
 use super::record::{BundleIdentity, Header, LoggedCall, LoggedOutcome, TickRecord, WholeState, digest};
 use super::report::{Difference, ReplayReport};
-use crate::controller::Gate;
+use crate::controller::SafetyFilter;
 use crate::engine::EngineSettings;
 use crate::policy::{CallKind, CallOutcome, Policy, State};
 use crate::telemetry::{Stage, Telemetry};
@@ -25,8 +25,8 @@ pub struct Replayer {
     telemetry: Telemetry,
     report: ReplayReport,
     resumed: bool,
-    gate: Gate,
-    /// What the gate let through last is in the log.
+    filter: SafetyFilter,
+    /// What the safety filter let through last is in the log.
     last_sent_known: bool,
     /// What the policy decided last in this tick.
     decided: Option<[f32; ACTION_LEN]>,
@@ -60,7 +60,7 @@ impl Replayer {
         Ok(Self {
             engine,
             bundles,
-            gate: Gate::new(&policy.manifest().control, header.rate_max),
+            filter: SafetyFilter::new(&policy.manifest().control, header.rate_max),
             policy,
             telemetry: Telemetry::new(),
             report,
@@ -109,7 +109,7 @@ impl Replayer {
     fn exchange(&mut self, identity: &BundleIdentity) -> Result<(), LogError> {
         self.policy = load(&self.bundles, identity, &self.report.log, self.engine)?;
         self.states.clear();
-        self.gate.take_limits(&self.policy.manifest().control);
+        self.filter.take_limits(&self.policy.manifest().control);
         self.report.swaps += 1;
         Ok(())
     }
@@ -263,7 +263,7 @@ impl Replayer {
             .then(|| ["whether work ahead was done again".into(), recomputed.to_string(), r.to_string()])
     }
 
-    /// What was sent: the policy's action, or the fallback, through the gate.
+    /// What was sent: the policy's action, or the fallback, through the filter.
     fn answer(&mut self, record: &TickRecord) -> Option<[String; 3]> {
         let (fallback, logged) = (self.report.log.fallback, record.answer.action);
         self.executed(record);
@@ -271,13 +271,13 @@ impl Replayer {
         let action = if of_policy.contains(&record.answer.source) {
             self.decided
         } else {
-            self.gate.fallback(fallback)
+            self.filter.fallback(fallback)
         };
         let replayed = if record.overtaken {
-            // It was not sent: it has not passed the gate, or there was nothing to send.
+            // It was not sent: it has not passed the safety filter, or there was nothing to send.
             Some(action.unwrap_or_default())
         } else {
-            action.and_then(|action| self.gate.pass(action)).map(|passed| passed.action)
+            action.and_then(|action| self.filter.pass(action)).map(|passed| passed.action)
         };
         let known = self.last_sent_known;
         self.sent(record);
@@ -287,7 +287,7 @@ impl Replayer {
 
     fn executed(&mut self, record: &TickRecord) {
         if let Some(observed) = &record.observed {
-            self.gate.observed(&observed.without_picture(), record.is_first);
+            self.filter.observed(&observed.without_picture(), record.is_first);
             self.last_sent_known |= record.is_first;
         }
     }
@@ -295,7 +295,7 @@ impl Replayer {
     fn sent(&mut self, record: &TickRecord) {
         // What is not finite was not sent, whatever the log says: it shows as a difference.
         if !record.overtaken && record.answer.action.iter().all(|x| x.is_finite()) {
-            self.gate.sent(record.answer.action);
+            self.filter.sent(record.answer.action);
             self.last_sent_known = true;
         }
     }

@@ -84,7 +84,7 @@ fn main() -> anyhow::Result<()> {
 }
 
 const HEADER: &str = "\
-| fault | times | stand-in after, periods | fallback after, periods | policy back after, ms | actions | imagined | fallback | stale | unfit | left |
+| fault | times | stand-in after, periods | fallback after, periods | policy back after, ms | actions | imagined | fallback | stale | invalid | left |
 | --- | --- | --- | --- | --- | --- | --- | --- | --- | --- | --- |";
 
 /// The name in the table and on the command line.
@@ -106,7 +106,7 @@ fn row(outcome: &Outcome) -> String {
         verdict.sources[1],
         verdict.sources[2],
         verdict.stale.len(),
-        verdict.unfit,
+        verdict.invalid,
         outcome.leftovers.len(),
     )
 }

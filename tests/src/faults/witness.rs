@@ -142,7 +142,7 @@ pub struct Verdict {
     /// Of them, by their source: the policy, imagined, fallback.
     pub sources: [usize; 3],
     /// Actions with a value that is not finite or not within [-1, 1].
-    pub unfit: usize,
+    pub invalid: usize,
     /// Actions that answer an observation although a newer one had been published for a millisecond.
     pub stale: Vec<Stale>,
 }
@@ -153,7 +153,7 @@ impl Record {
     pub fn verdict(&self) -> Verdict {
         let mut verdict = Verdict { actions: self.actions.len(), ..Verdict::default() };
         for action in &self.actions {
-            verdict.unfit += usize::from(!action.action.iter().all(|x| (-1.0..=1.0).contains(x)));
+            verdict.invalid += usize::from(!action.action.iter().all(|x| (-1.0..=1.0).contains(x)));
             verdict.stale.extend(self.stale(action));
             if let Some(source) = ActionSource::from_wire(action.source) {
                 verdict.sources[source as usize] += 1;

@@ -126,7 +126,7 @@ fn setup(rng: &mut ChaCha8Rng, bundles: usize) -> Setup {
         fallback,
         ticks: TickLimits {
             imagined_ticks_max: [0, 1, 5, 5, 50].choose(rng).copied().unwrap_or(5),
-            // Where the policy is unfit for longer the run ends, and with it the scenario.
+            // Where the policy gives nothing valid for longer the run ends, and with it the scenario.
             fallback_ticks_max: [3, 200, 200, u32::MAX].choose(rng).copied().unwrap_or(200),
         },
         pacing: PacingSettings {

@@ -12,7 +12,7 @@ use crate::child::Ended;
 pub(crate) struct Finding {
     /// Makes the case again.
     pub(crate) seed: u64,
-    /// `died`, `hung`, `slow`, `memory` or `unfit action`.
+    /// `died`, `hung`, `slow`, `memory` or `invalid action`.
     pub(crate) kind: &'static str,
     /// What is known about it.
     pub(crate) text: String,
@@ -84,8 +84,8 @@ impl Report {
                 self.cpu_s_max = self.cpu_s_max.max(outcome.cpu_s);
                 self.wall_s_max = self.wall_s_max.max(outcome.wall_s);
                 self.resident_mib_max = self.resident_mib_max.max(outcome.resident_mib_max);
-                let kind = if outcome.ended == "unfit action" {
-                    "unfit action"
+                let kind = if outcome.ended == "invalid action" {
+                    "invalid action"
                 } else if outcome.cpu_s > self.cpu_limit_s {
                     "slow"
                 } else if outcome.resident_mib_max > self.memory_limit_mib as f64 {

@@ -30,7 +30,7 @@ static PANICS: AtomicU64 = AtomicU64::new(0);
 pub(crate) struct Outcome {
     /// What was done.
     pub(crate) what: String,
-    /// How far it came: `open`, `inspect`, `load`, `tick`, `verify` refused it, or it was `accepted`; `unfit action` is a finding.
+    /// How far it came: `open`, `inspect`, `load`, `tick`, `verify` refused it, or it was `accepted`; `invalid action` is a finding.
     pub(crate) ended: String,
     /// The line a user would see.
     pub(crate) said: String,
@@ -106,7 +106,7 @@ fn use_as_the_runtime_does(folder: &Path) -> (&'static str, String) {
     };
     match ticks(&mut policy) {
         Ok(true) => {}
-        Ok(false) => return ("unfit action", String::new()),
+        Ok(false) => return ("invalid action", String::new()),
         Err(error) => return ("tick", one_line(&error)),
     }
     match rcwm_runtime::verify::verify(&bundle, EngineSettings::tract(), TOLERANCE, &mut || {}) {

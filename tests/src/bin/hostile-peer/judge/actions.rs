@@ -113,13 +113,13 @@ impl Judge {
             self.object("overtaken", || format!("{action:?} answers {heard:?}, while {other:?} waits"));
         }
         let surprise = &self.setup.surprise;
-        let unfit = !heard.is_fit();
+        let invalid = !heard.is_fit();
         let is_sound = self.running.iter().all(|running| running.is_sound);
         let may_fail = !is_sound || surprise.robot_max.is_some() || surprise.environment_max.is_some();
         let marked = match source {
-            ActionSource::Policy => !unfit,
+            ActionSource::Policy => !invalid,
             // One that had turned stale may be stood in for.
-            ActionSource::Fallback => unfit || may_fail || newest.borderline,
+            ActionSource::Fallback => invalid || may_fail || newest.borderline,
             ActionSource::Imagined => false,
         };
         if !marked {

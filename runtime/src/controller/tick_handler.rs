@@ -78,7 +78,7 @@ impl Controller {
         let rewound =
             observation.is(ObservationFlags::REPEATED) && self.rewind(sequence.saturating_add(1), false);
         if went_on {
-            self.gate.observed(observation, false);
+            self.filter.observed(observation, false);
         }
         let source = ActionSource::from_wire(own.source).unwrap_or(ActionSource::Fallback);
         if source == ActionSource::Policy {
@@ -90,7 +90,7 @@ impl Controller {
         }
         let answer = self.send(sequence, source, Some(own.action))?;
         if answer.published_ns > 0 {
-            // Where the gate has changed it, since the robot stands elsewhere by now, this is what is the same from here on.
+            // Where the safety filter has changed it, since the robot stands elsewhere by now, this is what is the same from here on.
             self.own_answer = Some(answer);
         }
         if went_on || rewound {
@@ -112,7 +112,7 @@ impl Controller {
             // Here only where the last episode was cut: else it happened in the idle time after its end.
             self.swap(Moment::BetweenEpisodes);
         }
-        self.gate.observed(observation, is_first);
+        self.filter.observed(observation, is_first);
         let rewound = self.rewind(observation.sequence, is_first);
         let (decision, event) = self.decide(observation, is_first);
         let (source, action) = self.respond(event, decision.as_ref())?;
@@ -156,7 +156,7 @@ impl Controller {
     fn decide(&mut self, observation: &Observation, is_first: bool) -> (Option<Decision>, Event) {
         if !observation.is_valid() {
             self.counters.refused_observations += 1;
-            return (None, Event::Unfit(Cause::Observation));
+            return (None, Event::Invalid(Cause::Observation));
         }
         // A new policy starts where it takes over, as at the first of an episode.
         let is_first = is_first | std::mem::take(&mut self.fresh_policy);
@@ -164,7 +164,7 @@ impl Controller {
             self.policy.observe(&observation.image, (!is_first).then_some(&observation.executed_action));
         let decision = match decided {
             Ok(decision) => decision,
-            Err(error) => return (None, Event::Unfit(self.count_failure(&error))),
+            Err(error) => return (None, Event::Invalid(self.count_failure(&error))),
         };
         self.record_stages(&decision);
         self.counters.recomputed += u64::from(decision.recomputed);
@@ -179,7 +179,7 @@ impl Controller {
             Some(_) => self.counters.environment_surprises += 1,
             None => {}
         }
-        (Some(decision), exceeded.map_or(Event::Decided, Event::Unfit))
+        (Some(decision), exceeded.map_or(Event::Decided, Event::Invalid))
     }
 
     fn count_failure(&mut self, error: &PolicyError) -> Cause {
@@ -210,21 +210,21 @@ impl Controller {
     }
 
     fn fallback(&self) -> Chosen {
-        (ActionSource::Fallback, self.gate.fallback(self.settings.fallback))
+        (ActionSource::Fallback, self.filter.fallback(self.settings.fallback))
     }
 
     /// Answers a tick whose observation has not come.
-    pub(super) fn go_without(
+    pub(super) fn handle_missing(
         &mut self,
         observers: &mut [&mut dyn TickObserver],
     ) -> Result<(), ControllerError> {
         let found_ns = self.link.now_ns();
         let Some(missing) = self.pacing.take_overdue(found_ns) else { return Ok(()) };
         // Where the policy has just taken over, it has seen nothing that it could go on from.
-        let held = self.gate.held().filter(|_| !self.fresh_policy);
+        let held = self.filter.held().filter(|_| !self.fresh_policy);
         let (mut state, mut response) = step(self.state, Event::Overdue, self.settings.ticks);
         if response == Response::Imagine && held.is_none() {
-            (state, response) = step(self.state, Event::Unfit(Cause::Silence), self.settings.ticks);
+            (state, response) = step(self.state, Event::Invalid(Cause::Silence), self.settings.ticks);
         }
         self.state = state;
         let (decision, (source, action)) = match (response, held) {
@@ -277,7 +277,7 @@ impl Controller {
             Err(error) => {
                 self.imagined.take_back();
                 let cause = self.count_failure(&error);
-                Ok((None, self.respond(Event::Unfit(cause), None)?))
+                Ok((None, self.respond(Event::Invalid(cause), None)?))
             }
         }
     }
@@ -334,7 +334,7 @@ impl Controller {
         source: ActionSource,
         action: Option<[f32; ACTION_LEN]>,
     ) -> Result<Action, ControllerError> {
-        let Some(passed) = action.and_then(|action| self.gate.pass(action)) else {
+        let Some(passed) = action.and_then(|action| self.filter.pass(action)) else {
             self.counters.withheld_answers += 1;
             return Ok(unsent(sequence, ActionSource::Fallback, None));
         };
@@ -349,7 +349,7 @@ impl Controller {
             action: passed.action,
         };
         answer.published_ns = self.link.send(answer)?;
-        self.gate.sent(answer.action);
+        self.filter.sent(answer.action);
         self.answer = Some(answer);
         self.counters.answers += 1;
         self.counters.fallback_answers += u64::from(source == ActionSource::Fallback);

@@ -39,7 +39,7 @@ impl FromStr for Fallback {
     }
 }
 
-/// What has passed the gate.
+/// What has passed the filter.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct Passed {
     /// The action, fit to be sent.
@@ -52,7 +52,7 @@ pub struct Passed {
 
 /// Makes every action fit, and knows what the robot does without a new one.
 #[derive(Debug, Clone, Copy)]
-pub struct Gate {
+pub struct SafetyFilter {
     limits: ActionLimits,
     mode: ActionMode,
     rate_max: Option<f32>,
@@ -62,8 +62,8 @@ pub struct Gate {
     sent: Option<[f32; ACTION_LEN]>,
 }
 
-impl Gate {
-    /// A gate with the limits of a bundle; with `rate_max`, no component moves by more than that from what was executed last.
+impl SafetyFilter {
+    /// A safety filter with the limits of a bundle; with `rate_max`, no component moves by more than that from what was executed last.
     #[must_use]
     pub fn new(control: &Control, rate_max: Option<f32>) -> Self {
         // Written so that NaN allows no motion.
@@ -164,13 +164,13 @@ mod tests {
         Control { rate_hz: 40.0, action_low: LOW, action_high: HIGH, action_mode: mode }
     }
 
-    fn gate(rate_max: Option<f32>) -> Gate {
-        Gate::new(&control(ActionMode::Delta), rate_max)
+    fn safety_filter(rate_max: Option<f32>) -> SafetyFilter {
+        SafetyFilter::new(&control(ActionMode::Delta), rate_max)
     }
 
-    fn send(gate: &mut Gate, action: [f32; ACTION_LEN]) -> Passed {
-        let passed = gate.pass(action).unwrap();
-        gate.sent(passed.action);
+    fn send(filter: &mut SafetyFilter, action: [f32; ACTION_LEN]) -> Passed {
+        let passed = filter.pass(action).unwrap();
+        filter.sent(passed.action);
         passed
     }
 
@@ -198,84 +198,84 @@ mod tests {
     #[test]
     fn what_is_not_finite_becomes_what_was_executed_last() {
         for mode in [ActionMode::Delta, ActionMode::Velocity, ActionMode::Absolute] {
-            let mut gate = Gate::new(&control(mode), None);
-            gate.observed(&executed([0.4, -0.3, 0.5, 0.9]), true);
+            let mut filter = SafetyFilter::new(&control(mode), None);
+            filter.observed(&executed([0.4, -0.3, 0.5, 0.9]), true);
             for bad in [f32::NAN, f32::INFINITY, f32::NEG_INFINITY] {
-                let passed = gate.pass([0.5, bad, 0.5, 0.5]).unwrap();
+                let passed = filter.pass([0.5, bad, 0.5, 0.5]).unwrap();
                 assert_eq!((passed.action, passed.was_not_finite), ([0.4, -0.3, 0.5, 0.9], true));
             }
-            assert!(!gate.pass([9.0; 4]).unwrap().was_not_finite);
-            send(&mut gate, [0.1, 0.2, 0.3, 0.4]);
-            assert_eq!(gate.pass([f32::NAN; 4]).unwrap().action, [0.1, 0.2, 0.3, 0.4]);
+            assert!(!filter.pass([9.0; 4]).unwrap().was_not_finite);
+            send(&mut filter, [0.1, 0.2, 0.3, 0.4]);
+            assert_eq!(filter.pass([f32::NAN; 4]).unwrap().action, [0.1, 0.2, 0.3, 0.4]);
         }
     }
 
     #[test]
     fn before_anything_is_known_displacements_rest_and_positions_are_not_invented() {
         for mode in [ActionMode::Delta, ActionMode::Velocity] {
-            let gate = Gate::new(&control(mode), Some(0.1));
-            assert_eq!(gate.fallback(Fallback::Hold), Some([0.0; 4]));
-            assert_eq!(gate.pass([f32::NAN; 4]).unwrap().action, [0.0, 0.0, 0.2, 0.0]);
+            let filter = SafetyFilter::new(&control(mode), Some(0.1));
+            assert_eq!(filter.fallback(Fallback::Hold), Some([0.0; 4]));
+            assert_eq!(filter.pass([f32::NAN; 4]).unwrap().action, [0.0, 0.0, 0.2, 0.0]);
         }
-        let mut gate = Gate::new(&control(ActionMode::Absolute), Some(0.1));
-        gate.observed(&first([0.0; 4]), true);
-        let nothing = gate.pass([f32::NAN; 4]).is_none();
+        let mut filter = SafetyFilter::new(&control(ActionMode::Absolute), Some(0.1));
+        filter.observed(&first([0.0; 4]), true);
+        let nothing = filter.pass([f32::NAN; 4]).is_none();
         assert!(
-            nothing && gate.fallback(Fallback::Hold).is_none() && gate.fallback(Fallback::Zero).is_none()
+            nothing && filter.fallback(Fallback::Hold).is_none() && filter.fallback(Fallback::Zero).is_none()
         );
         // Nothing tells how far the policy's position is from the robot's.
-        assert_eq!(gate.pass([0.9, 0.4, 0.9, 0.9]).unwrap().action, [0.9, 0.4, 0.9, 0.9]);
+        assert_eq!(filter.pass([0.9, 0.4, 0.9, 0.9]).unwrap().action, [0.9, 0.4, 0.9, 0.9]);
     }
 
     #[test]
     fn a_position_is_held_across_the_start_of_an_episode_and_a_motion_is_not() {
         for (mode, held) in [(ActionMode::Absolute, [0.7; 4]), (ActionMode::Delta, [0.0; 4])] {
-            let mut gate = Gate::new(&control(mode), None);
-            gate.observed(&executed([0.7; 4]), true);
-            gate.observed(&first([0.0; 4]), true);
-            assert_eq!(gate.held(), Some(held), "{mode:?}");
-            assert_eq!(gate.fallback(Fallback::Zero), Some(held), "{mode:?}");
+            let mut filter = SafetyFilter::new(&control(mode), None);
+            filter.observed(&executed([0.7; 4]), true);
+            filter.observed(&first([0.0; 4]), true);
+            assert_eq!(filter.held(), Some(held), "{mode:?}");
+            assert_eq!(filter.fallback(Fallback::Zero), Some(held), "{mode:?}");
             // A robot that says where it stands is believed.
-            gate.observed(&first([0.3; 4]), true);
-            assert_eq!(gate.held(), Some([0.3; 4]), "{mode:?}");
+            filter.observed(&first([0.3; 4]), true);
+            assert_eq!(filter.held(), Some([0.3; 4]), "{mode:?}");
         }
     }
 
     #[test]
     fn a_robot_that_does_not_say_that_it_starts_is_not_taken_to_rest() {
-        let mut gate = gate(Some(0.1));
-        gate.sent([0.4; 4]);
+        let mut filter = safety_filter(Some(0.1));
+        filter.sent([0.4; 4]);
         // Another episode or another publisher, whose first observation never came, with numbers that are none.
-        gate.observed(&executed([f32::NAN; 4]), true);
-        assert_eq!(gate.fallback(Fallback::Hold), Some([0.4; 4]));
-        assert_near(gate.pass([-1.0; 4]), [0.3; 4]);
-        gate.observed(&first([0.0; 4]), true);
-        assert_eq!(gate.fallback(Fallback::Hold), Some([0.0; 4]));
+        filter.observed(&executed([f32::NAN; 4]), true);
+        assert_eq!(filter.fallback(Fallback::Hold), Some([0.4; 4]));
+        assert_near(filter.pass([-1.0; 4]), [0.3; 4]);
+        filter.observed(&first([0.0; 4]), true);
+        assert_eq!(filter.fallback(Fallback::Hold), Some([0.0; 4]));
     }
 
     #[test]
     fn an_observation_that_is_refused_changes_what_is_held_only_where_nothing_is_known() {
         let mut refused = executed([0.6; 4]);
         refused.reward = f32::NAN;
-        let mut gate = gate(None);
-        gate.observed(&refused, true);
-        assert_eq!(gate.held(), Some([0.6; 4]));
-        gate.sent([0.1; 4]);
+        let mut filter = safety_filter(None);
+        filter.observed(&refused, true);
+        assert_eq!(filter.held(), Some([0.6; 4]));
+        filter.sent([0.1; 4]);
         for bad in [0.8, 3e38, f32::NAN] {
             refused.executed_action = [bad; 4];
-            gate.observed(&refused, false);
-            assert_eq!(gate.held(), Some([0.1; 4]), "{bad}");
+            filter.observed(&refused, false);
+            assert_eq!(filter.held(), Some([0.1; 4]), "{bad}");
         }
-        gate.observed(&executed([3e38; 4]), false);
-        assert_eq!(gate.held(), Some([0.1; 4]));
+        filter.observed(&executed([3e38; 4]), false);
+        assert_eq!(filter.held(), Some([0.1; 4]));
     }
 
     #[test]
     fn no_component_moves_faster_than_the_rate_limit_and_all_stay_within_the_limits() {
-        let mut gate = gate(Some(0.3));
+        let mut filter = safety_filter(Some(0.3));
         let mut last = [0.0; 4];
         for wanted in [[9.0; 4], [9.0; 4], [-9.0; 4], [f32::NAN; 4], [-9.0; 4], [0.1, 0.1, 0.3, 0.1]] {
-            let action = send(&mut gate, wanted).action;
+            let action = send(&mut filter, wanted).action;
             let near = action.iter().zip(last).all(|(a, b)| (a - b).abs() <= 0.3 + 1e-6);
             assert!(near && within_limits(action), "{action:?} after {last:?}");
             last = action;
@@ -284,52 +284,52 @@ mod tests {
 
     #[test]
     fn limits_come_last_even_where_another_policy_has_narrower_ones_than_what_was_sent() {
-        let mut gate = gate(Some(0.1));
-        gate.sent([0.9, 0.5, 0.9, -0.9]);
+        let mut filter = safety_filter(Some(0.1));
+        filter.sent([0.9, 0.5, 0.9, -0.9]);
         let control = Control { action_low: [-0.2; 4], action_high: [0.2; 4], ..control(ActionMode::Delta) };
-        gate.take_limits(&control);
-        assert_eq!(gate.pass([1.0, 1.0, 1.0, -1.0]).unwrap().action, [0.2, 0.2, 0.2, -0.2]);
-        assert_eq!(gate.pass([f32::NAN; 4]).unwrap().action, [0.2, 0.2, 0.2, -0.2]);
+        filter.take_limits(&control);
+        assert_eq!(filter.pass([1.0, 1.0, 1.0, -1.0]).unwrap().action, [0.2, 0.2, 0.2, -0.2]);
+        assert_eq!(filter.pass([f32::NAN; 4]).unwrap().action, [0.2, 0.2, 0.2, -0.2]);
     }
 
     #[test]
     fn the_rate_limit_counts_from_what_was_executed_whoever_moved_the_robot() {
-        let mut gate = gate(Some(0.1));
+        let mut filter = safety_filter(Some(0.1));
         // Joined in the middle of an episode.
-        gate.observed(&executed([0.9, -0.9, 0.9, 0.9]), true);
-        assert_near(gate.pass([-1.0; 4]), [0.8, -1.0, 0.8, 0.8]);
-        send(&mut gate, [0.9, -0.9, 0.9, 0.9]);
+        filter.observed(&executed([0.9, -0.9, 0.9, 0.9]), true);
+        assert_near(filter.pass([-1.0; 4]), [0.8, -1.0, 0.8, 0.8]);
+        send(&mut filter, [0.9, -0.9, 0.9, 0.9]);
         // What was sent was not executed.
-        gate.observed(&executed([0.0, 0.0, 0.5, 0.0]), false);
-        assert_near(gate.pass([1.0; 4]), [0.1, 0.1, 0.6, 0.1]);
+        filter.observed(&executed([0.0, 0.0, 0.5, 0.0]), false);
+        assert_near(filter.pass([1.0; 4]), [0.1, 0.1, 0.6, 0.1]);
     }
 
     #[test]
     fn an_action_that_is_executed_one_observation_later_is_not_left_by_more_than_the_limit_either() {
-        let mut gate = gate(Some(0.1));
-        gate.observed(&first([0.0; 4]), true);
-        send(&mut gate, [1.0; 4]);
-        gate.observed(&executed([0.0; 4]), false);
-        let back = gate.pass([-1.0; 4]).unwrap().action;
+        let mut filter = safety_filter(Some(0.1));
+        filter.observed(&first([0.0; 4]), true);
+        send(&mut filter, [1.0; 4]);
+        filter.observed(&executed([0.0; 4]), false);
+        let back = filter.pass([-1.0; 4]).unwrap().action;
         assert!(back[0].abs() < 1e-6, "{back:?}, after 0.1 was sent");
     }
 
     #[test]
     fn an_episode_starts_from_rest_and_what_was_not_sent_does_not_count() {
-        let mut gate = gate(Some(0.5));
-        send(&mut gate, [1.0; 4]);
-        assert_eq!(gate.pass([1.0; 4]).unwrap().action, [1.0, 0.5, 1.0, 1.0]);
-        assert_eq!(gate.held(), Some([0.5; 4]));
-        gate.observed(&first([0.0; 4]), true);
-        assert_eq!(gate.pass([1.0; 4]).unwrap().action, [0.5; 4]);
-        assert!(!gate.pass([0.1, 0.1, 0.3, 0.1]).unwrap().rate_limited);
+        let mut filter = safety_filter(Some(0.5));
+        send(&mut filter, [1.0; 4]);
+        assert_eq!(filter.pass([1.0; 4]).unwrap().action, [1.0, 0.5, 1.0, 1.0]);
+        assert_eq!(filter.held(), Some([0.5; 4]));
+        filter.observed(&first([0.0; 4]), true);
+        assert_eq!(filter.pass([1.0; 4]).unwrap().action, [0.5; 4]);
+        assert!(!filter.pass([0.1, 0.1, 0.3, 0.1]).unwrap().rate_limited);
     }
 
     #[test]
     fn fallbacks_are_named_or_given() {
-        let mut gate = gate(None);
-        gate.sent([0.1, 0.2, 0.3, 0.4]);
-        let action = |text: &str| gate.fallback(text.parse().unwrap()).unwrap();
+        let mut filter = safety_filter(None);
+        filter.sent([0.1, 0.2, 0.3, 0.4]);
+        let action = |text: &str| filter.fallback(text.parse().unwrap()).unwrap();
         assert_eq!(action("hold"), [0.1, 0.2, 0.3, 0.4]);
         assert_eq!(action("zero"), [0.0; 4]);
         assert_eq!(action("0, 0,0.5,-1"), [0.0, 0.0, 0.5, -1.0]);
