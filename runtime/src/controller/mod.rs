@@ -19,7 +19,9 @@ mod imagined;
 mod machine;
 mod report;
 mod safety_filter;
+mod sending;
 mod sequence;
+mod settings;
 mod surprise;
 mod tick;
 mod tick_handler;
@@ -32,6 +34,7 @@ pub use machine::{Cause, Event, Response, State, TickLimits, step};
 pub use report::{Counters, EpisodeResult, Pace, RunReport};
 pub use safety_filter::{Fallback, Passed, SafetyFilter};
 pub use sequence::{Arrival, SequenceTracker};
+pub use settings::ControllerSettings;
 pub use surprise::{BranchSurprise, SurpriseLimits, SurpriseReport};
 pub use tick::{Tick, TickObserver, TickTimes};
 pub use transport::Transport;
@@ -40,9 +43,9 @@ use std::sync::atomic::{AtomicBool, Ordering};
 use std::time::Duration;
 
 use rcwm_models::bundle::ActionMode;
-use rcwm_models::wire::{Action, ControllerLink, LinkSettings, ObservationSample, Wait};
+use rcwm_models::wire::{Action, ControllerLink, ObservationSample, Wait};
 
-use crate::pacing::{Pacing, PacingSettings, Plan};
+use crate::pacing::{Pacing, Plan};
 use crate::policy::Policy;
 use crate::swap::{Moment, Swapper};
 use crate::telemetry::{Stage, Telemetry};
@@ -53,50 +56,6 @@ use surprise::SurpriseTelemetry;
 const WAIT_SLICE: Duration = Duration::from_millis(100);
 /// Silence after which dead peers are cleaned up and the simulator is asked for its observation.
 const QUIET: Duration = Duration::from_millis(500);
-
-/// How the loop runs.
-#[derive(Debug, Clone)]
-pub struct ControllerSettings {
-    /// The link.
-    pub link: LinkSettings,
-    /// Ends after this many whole episodes.
-    pub episodes_max: Option<u64>,
-    /// Waits for another simulator when one has closed.
-    pub stay: bool,
-    /// Longest wait for the first observation; none waits for ever.
-    pub first_timeout: Option<Duration>,
-    /// Longest silence of a peer that was there; none waits for ever.
-    pub silence_max: Option<Duration>,
-    /// How to wait, and what is late.
-    pub pacing: PacingSettings,
-    /// How long the policy is done without.
-    pub ticks: TickLimits,
-    /// What is sent when the policy has nothing fit to send.
-    pub fallback: Fallback,
-    /// How much surprise is borne.
-    pub surprise: SurpriseLimits,
-    /// Largest change of an action's component from one action to the next; at least 0.
-    pub rate_max: Option<f32>,
-}
-
-impl ControllerSettings {
-    /// Waits for ever, holds the last action as the fallback, and bears any surprise.
-    #[must_use]
-    pub fn new(link: LinkSettings) -> Self {
-        Self {
-            link,
-            episodes_max: None,
-            stay: false,
-            first_timeout: None,
-            silence_max: None,
-            pacing: PacingSettings::default(),
-            ticks: TickLimits::default(),
-            fallback: Fallback::Hold,
-            surprise: SurpriseLimits::default(),
-            rate_max: None,
-        }
-    }
-}
 
 /// A policy on a link.
 pub struct Controller {

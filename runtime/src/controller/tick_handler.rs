@@ -15,12 +15,6 @@ use crate::telemetry::Stage;
 /// What to send, and where it comes from; no action where nothing is known that could be held.
 type Chosen = (ActionSource, Option<[f32; ACTION_LEN]>);
 
-/// An answer that stays here.
-fn unsent(sequence: u64, source: ActionSource, action: Option<[f32; ACTION_LEN]>) -> Action {
-    let action = action.unwrap_or_default();
-    Action { answers: sequence, published_ns: 0, source: source as u32, reserved: 0, action }
-}
-
 /// A tick on its way to the observers.
 struct Ticked<'a> {
     observation: Option<&'a Observation>,
@@ -280,81 +274,6 @@ impl Controller {
                 Ok((None, self.respond(Event::Invalid(cause), None)?))
             }
         }
-    }
-
-    /// Whether a newer observation has come while this one was worked on: an answer to this one would be stale. Looked for only
-    /// where the tick's time is over, so that a tick in time loses none.
-    fn is_overtaken(&mut self, observation: &Observation, received_ns: u64) -> Result<bool, ControllerError> {
-        let (period_ns, due_ns) = (observation.period_ns, Stamps::of(observation, received_ns).scheduled_ns);
-        if period_ns == 0 || self.link.now_ns() <= due_ns.saturating_add(period_ns) {
-            return Ok(false);
-        }
-        self.newer = self.link.poll()?;
-        Ok(self.newer.as_ref().is_some_and(|newer| self.arrival(newer, self.link.now_ns()).is_new()))
-    }
-
-    /// What an observation is to those before it; one that was due too long ago is stale, whatever its number.
-    fn arrival(&self, sample: &ObservationSample, received_ns: u64) -> Arrival {
-        let observation: &Observation = sample.payload();
-        if self.pacing.is_stale(observation, received_ns) {
-            return Arrival::Stale;
-        }
-        self.tracker.look(sample.origin().value(), observation.sequence, observation.episode)
-    }
-
-    /// Whether an observation that has come will get an answer of its own, however many ticks were answered without it.
-    fn will_answer(&self, sample: &ObservationSample) -> bool {
-        let arrival = self.arrival(sample, self.link.now_ns());
-        let again = || {
-            let known = self.own_answer.is_some_and(|own| own.answers == sample.sequence);
-            known && sample.is(ObservationFlags::REPEATED)
-        };
-        arrival.is_new() || (arrival == Arrival::Repeated && again())
-    }
-
-    /// Sends, or counts that a newer observation has made the answer stale.
-    fn send_unless(
-        &mut self,
-        overtaken: bool,
-        sequence: u64,
-        source: ActionSource,
-        action: Option<[f32; ACTION_LEN]>,
-    ) -> Result<Action, ControllerError> {
-        if !overtaken {
-            return self.send(sequence, source, action);
-        }
-        self.counters.overtaken_answers += 1;
-        Ok(unsent(sequence, source, action))
-    }
-
-    /// The only way onto the wire. Where there is nothing fit to send nor to hold, the robot goes on with what it knows itself.
-    fn send(
-        &mut self,
-        sequence: u64,
-        source: ActionSource,
-        action: Option<[f32; ACTION_LEN]>,
-    ) -> Result<Action, ControllerError> {
-        let Some(passed) = action.and_then(|action| self.filter.pass(action)) else {
-            self.counters.withheld_answers += 1;
-            return Ok(unsent(sequence, ActionSource::Fallback, None));
-        };
-        self.counters.non_finite_outputs += u64::from(passed.was_not_finite);
-        self.counters.rate_limited += u64::from(passed.rate_limited);
-        let source = if passed.was_not_finite { ActionSource::Fallback } else { source };
-        let mut answer = Action {
-            answers: sequence,
-            published_ns: 0,
-            source: source as u32,
-            reserved: 0,
-            action: passed.action,
-        };
-        answer.published_ns = self.link.send(answer)?;
-        self.filter.sent(answer.action);
-        self.answer = Some(answer);
-        self.counters.answers += 1;
-        self.counters.fallback_answers += u64::from(source == ActionSource::Fallback);
-        self.counters.imagined_answers += u64::from(source == ActionSource::Imagined);
-        Ok(answer)
     }
 
     /// In the idle time: all of the next tick that needs only the action. What fails here fails again, and is counted, in the tick.

@@ -14,6 +14,7 @@
 
 mod calls;
 mod compiled;
+mod error;
 mod limits;
 mod noise;
 mod parts;
@@ -23,6 +24,7 @@ mod state;
 mod tick;
 
 pub use calls::{CALLS_MAX, Call, CallKind, CallOutcome};
+pub use error::PolicyError;
 pub use limits::ActionLimits;
 pub use noise::Sampling;
 pub use parts::{BranchBuffers, Buffers};
@@ -31,43 +33,14 @@ pub use state::{BranchState, State};
 use std::path::Path;
 use std::time::Instant;
 
-use rcwm_models::bundle::{Bundle, BundleError, Manifest, PartName};
+use rcwm_models::bundle::{Bundle, Manifest, PartName};
 use rcwm_models::{ACTION_LEN, IMAGE_BYTES};
 
-use crate::compile::CompileError;
-use crate::engine::{EngineError, EngineSettings, Form};
+use crate::engine::{EngineSettings, Form};
 use calls::CallRing;
 use noise::NoiseSource;
 use stages::StageClock;
 use tick::{Tick, Work};
-
-/// Why there is no policy, or no decision.
-#[derive(Debug, thiserror::Error)]
-pub enum PolicyError {
-    /// The bundle was refused.
-    #[error(transparent)]
-    Bundle(#[from] BundleError),
-    /// An engine could not load or run a part.
-    #[error(transparent)]
-    Engine(#[from] EngineError),
-    /// The parts could not be made into a tick.
-    #[error(transparent)]
-    Compile(#[from] CompileError),
-    /// The second thread could not be started.
-    #[error("starting the tick's second thread: {0}; use --threads 1")]
-    Thread(String),
-    /// What was observed is not fit for the policy.
-    #[error("observation refused: {0}")]
-    Observation(String),
-    /// A part gave a number that is not finite, or a class that does not exist; the carried state is unchanged.
-    #[error("{part} gave a value of {output} that is not finite or not a class")]
-    NotFinite {
-        /// The part.
-        part: PartName,
-        /// Its output.
-        output: &'static str,
-    },
-}
 
 /// Stages of a tick that are timed one by one, in the order they run.
 pub const STAGES: [PartName; 5] = PartName::REQUIRED;

@@ -18,6 +18,7 @@ mod python;
 pub mod report;
 pub mod schedule;
 pub mod serve;
+mod settings;
 pub mod snapshot;
 
 pub use error::SimulatorError;

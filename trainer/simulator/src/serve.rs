@@ -4,7 +4,6 @@
 //! real time the last action is held for a while, and not at all when the controller has said that it leaves: then the robot rests
 //! until the next one answers.
 
-use std::path::PathBuf;
 use std::sync::atomic::{AtomicBool, Ordering};
 use std::time::{Duration, Instant};
 
@@ -13,9 +12,10 @@ use rcwm_models::wire::clock::monotonic_ns;
 use rcwm_models::wire::{Action, Events, Observation, ObservationFlags, SimulatorLink, Wait};
 
 use crate::environment::{Environment, STEPS_MAX};
-use crate::policy::{Policy, Script};
+use crate::policy::Script;
 use crate::report::Tally;
 use crate::schedule::{Schedule, sleep_until};
+pub use crate::settings::{Pace, ServeSettings};
 use crate::{SimulatorError, snapshot};
 
 /// The longest single wait, so that a stop is noticed.
@@ -26,42 +26,6 @@ const SILENCE: Duration = Duration::from_secs(1);
 const HOLD_NS_MAX: u64 = 1_000_000_000;
 /// Steps between two snapshots of the first episode.
 const SNAPSHOT_STEPS: u32 = 50;
-
-/// How time passes.
-#[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub enum Pace {
-    /// Each observation waits for its answer.
-    LockStep,
-    /// As lock-step with a scripted policy, but nobody is waited for.
-    Free,
-    /// A fixed clock.
-    RealTime {
-        /// Time between two observations.
-        period_ns: u64,
-    },
-}
-
-/// How to serve.
-#[derive(Debug, Clone)]
-pub struct ServeSettings {
-    /// The link's name, for messages.
-    pub instance: String,
-    /// The first episode's number.
-    pub first_episode: u64,
-    /// How many episodes; `None` until stopped.
-    pub episodes: Option<u64>,
-    /// Decisions in an episode, 1 to [`STEPS_MAX`].
-    pub steps_max: u32,
-    /// How time passes.
-    pub pace: Pace,
-    /// Who decides.
-    pub policy: Policy,
-    /// The longest silence of the controller that is borne: at any time in lock-step, before the first episode in real
-    /// time. `None` for ever.
-    pub silence_max: Option<Duration>,
-    /// Folder for pictures of the first episode.
-    pub snapshots: Option<PathBuf>,
-}
 
 /// Where the run is: everything of an observation that the environment does not know.
 #[derive(Debug, Clone, Copy, Default)]

@@ -1,3 +1,5 @@
+mod acting;
+
 use std::collections::VecDeque;
 use std::path::{Path, PathBuf};
 use std::sync::atomic::{AtomicBool, Ordering};
@@ -254,94 +256,6 @@ impl Finetuning {
         Ok(())
     }
 
-    /// Answers every observation; the last of an episode by zeros, which nobody executes.
-    fn act(
-        &mut self,
-        gathered: &[Gathered],
-        fleet: &mut Fleet,
-        policy: &mut Policy,
-    ) -> Result<(), TrainingError> {
-        let going_on: Vec<_> = gathered.iter().filter(|one| !one.is_last()).collect();
-        let seen: Vec<_> = going_on.iter().map(|one| one.seen()).collect();
-        let number = noise_number(self.state.policy_steps, gathered.iter().all(Gathered::is_first));
-        let mut sampler = Sampler::numbered(self.settings.seed ^ ACTING_STREAM, number);
-        let decisions = policy.decide(&seen, &mut sampler)?;
-        for (one, decision) in going_on.into_iter().zip(&decisions) {
-            fleet.answer(one, decision.action)?;
-        }
-        for one in gathered.iter().filter(|one| one.is_last()) {
-            fleet.answer(one, [0.0; rcwm_models::ACTION_LEN])?;
-        }
-        self.state.policy_steps += gathered.iter().filter(|one| !one.is_first()).count() as u64;
-        let refused = decisions.iter().filter(|decision| decision.refused).count() as u64;
-        self.refused_actions += refused;
-        if refused > 0 {
-            check_finite(&self.parameters)?;
-        }
-        Ok(())
-    }
-
-    /// Makes the evaluation that is due.
-    fn evaluate(
-        &mut self,
-        learning: &mut Learning,
-        stop: &AtomicBool,
-        show: &mut impl FnMut(&OnlineProgress<'_>),
-    ) -> Result<(), TrainingError> {
-        let due = self.settings.finetune.evaluation.due(self.state.policy_steps);
-        if due <= self.evaluations || stop.load(Ordering::Relaxed) {
-            return Ok(());
-        }
-        self.write_back()?;
-        let agent = Agent::new(&self.parameters.frozen(), &self.settings.model)?;
-        let steps = (self.state.policy_steps, ACTION_REPEAT * self.state.policy_steps);
-        let found = learning
-            .interval
-            .time(TimeBucket::Evaluating, || evaluate(agent, &self.settings, steps, stop))?;
-        if let Some(evaluation) = found {
-            self.evaluations = due;
-            let line = EvaluationLine { update: self.state.updates, phase: ONLINE, evaluation };
-            self.run.log(&line)?;
-            show(&OnlineProgress { evaluation: Some(&line), ..self.progress() });
-        }
-        Ok(())
-    }
-
-    /// Keeps an episode: on disk, in the replay, in the metrics.
-    fn keep(
-        &mut self,
-        recorded: Recorded,
-        replay: &SharedReplay,
-        show: &mut impl FnMut(&OnlineProgress<'_>),
-    ) -> Result<(), TrainingError> {
-        let Recorded { simulator, episode } = recorded;
-        let path = policy_episode(&self.folder, &self.settings.task, self.state.policy_steps, simulator);
-        if let Some(folder) = path.parent() {
-            std::fs::create_dir_all(folder)
-                .map_err(|source| TrainingError::Folder { path: folder.to_path_buf(), source })?;
-        }
-        episode.write(&path)?;
-        self.state.episodes += 1;
-        self.newest.push_back(episode.succeeded());
-        if self.newest.len() > self.settings.finetune.success_episodes {
-            self.newest.pop_front();
-        }
-        let facts = EpisodeFacts {
-            number: self.state.episodes,
-            simulator,
-            success: episode.succeeded(),
-            total_reward: episode.total_reward(),
-            steps: episode.len() as u64 - 1,
-            policy_steps: self.state.policy_steps,
-            environment_steps: ACTION_REPEAT * self.state.policy_steps,
-        };
-        replay.add(&self.settings.task, episode)?;
-        let line = EpisodeLine { update: self.state.updates, phase: ONLINE, episode: facts };
-        self.run.log(&line)?;
-        show(&OnlineProgress { episode: Some(&line), ..self.progress() });
-        Ok(())
-    }
-
     /// Makes the updates that are due.
     fn learn(
         &mut self,
@@ -407,28 +321,6 @@ impl Finetuning {
         })?)
     }
 
-    /// What simulators are to run: new layouts, also after a run was resumed.
-    fn launches(&self) -> Vec<Launch> {
-        let finetune = &self.settings.finetune;
-        let launch = |index: usize| {
-            let instance = format!("{}-{}-{index}", self.settings.phase.verb(), std::process::id());
-            let first = FIRST_EPISODE + index as u64 * EPISODES_A_SIMULATOR + self.state.episodes;
-            let usual = Launch::remote(&self.settings.task, &instance, self.settings.seed);
-            let evaluation = &finetune.evaluation;
-            let evaluated = if evaluation.every_steps > 0 { evaluation.episodes } else { 0 };
-            Launch {
-                // They stand still while separate episodes are run.
-                silence_max: usual.silence_max + EVALUATED_EPISODE_MAX * evaluated as u32,
-                first_episode: first,
-                steps_max: finetune.episode_steps,
-                masks: finetune.masks,
-                disturb: finetune.disturb.clone(),
-                ..usual
-            }
-        };
-        (0..finetune.simulators).map(launch).collect()
-    }
-
     /// Saves a checkpoint; it is the best if the newest episodes had the highest success rate of all checkpoints, the first of equals.
     fn save(&mut self) -> Result<(), TrainingError> {
         self.write_back()?;
@@ -465,12 +357,6 @@ impl Finetuning {
     }
 }
 
-/// Which noise a decision takes after so many steps. The first decisions of episodes are no steps yet: with steps alone the second
-/// ones would take the same noise.
-fn noise_number(policy_steps: u64, all_first: bool) -> u64 {
-    2 * policy_steps + u64::from(!all_first)
-}
-
 /// Name of the stage in which the policy acts.
 const ONLINE: &str = "online";
 
@@ -490,21 +376,4 @@ fn check_finite(parameters: &Parameters) -> Result<(), TrainingError> {
         }
     }
     Ok(())
-}
-
-#[cfg(test)]
-mod tests {
-    use super::*;
-
-    #[test]
-    fn no_two_decisions_take_the_same_noise() {
-        let (mut steps, mut numbers) = (0, std::collections::BTreeSet::new());
-        for _episode in 0..3 {
-            for tick in 0..5 {
-                assert!(numbers.insert(noise_number(steps, tick == 0)), "tick {tick} after {steps} steps");
-                // Two simulators; what leads to an episode's first observation is no step.
-                steps += if tick == 0 { 0 } else { 2 };
-            }
-        }
-    }
 }
