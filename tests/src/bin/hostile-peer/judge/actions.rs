@@ -29,7 +29,7 @@ impl Judge {
             return self.object("answers nothing", || format!("{action:?} before any message"));
         };
         self.turned_stale(self.looks_ns[1]);
-        let newest = self.newest_for(action, source).unwrap_or(newest);
+        let newest = self.newest_for(action, source, now_ns).unwrap_or(newest);
         self.bases = self.bases_of(&newest);
         self.before = self.last.filter(|_| self.in_episode);
         self.is_free = self.may_withhold();
@@ -44,17 +44,24 @@ impl Judge {
         }
         self.last = Some(*action);
         (self.in_episode, self.is_held) = (true, true);
+        self.unanswered_executed.clear();
         self.due = Due::default();
     }
 
     /// The newest message when this was sent: one before where those since may have turned stale on the way, and this is for none of
-    /// them.
-    fn newest_for(&mut self, action: &Action, source: ActionSource) -> Option<Newest> {
+    /// them, nor for what is missing after one of them that was overtaken.
+    fn newest_for(&mut self, action: &Action, source: ActionSource, now_ns: u64) -> Option<Newest> {
+        let grace = self.setup.pacing.grace_periods;
+        let may_follow = |Newest { heard, overtaken, follows, .. }: &Newest| {
+            let ticks = action.answers.saturating_sub(heard.sequence);
+            *overtaken && *follows && ticks > 0 && now_ns >= heard.due_ns(ticks, grace).0
+        };
         let is_for =
             |newest: &Newest| action.answers == newest.heard.sequence && source != ActionSource::Imagined;
         while let Some(newest) = self.newest
             && newest.may_be_dropped()
             && !is_for(&newest)
+            && !may_follow(&newest)
             && let Some((previous, in_episode)) = self.previous.pop()
         {
             (self.newest, self.in_episode) = (Some(previous), in_episode);

@@ -31,9 +31,16 @@ impl Judge {
             }
             _ => true,
         };
-        if let Some(newest) = self.newest {
+        if let Some(mut newest) = self.newest {
             if !newest.may_be_dropped() {
                 self.previous.clear();
+            }
+            if newest.answer.is_none() {
+                // What was found meanwhile may turn stale, and this one be the newest without an answer.
+                newest.overtaken = polled;
+                newest.borderline |= polled;
+                self.unanswered_executed
+                    .extend(Some(newest.heard.executed).filter(|_| newest.heard.is_fit()));
             }
             self.previous.push((newest, self.in_episode));
         }
@@ -58,6 +65,7 @@ impl Judge {
             swapped: false,
             follows,
             unclear: false,
+            overtaken: false,
             stood_in_for: false,
             executed_again: None,
             exhausted: false,

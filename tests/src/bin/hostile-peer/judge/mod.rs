@@ -52,6 +52,8 @@ struct Newest {
     unclear: bool,
     /// It may have turned stale, and what was sent be the stand-in for it.
     stood_in_for: bool,
+    /// Another was found in the middle of its tick.
+    overtaken: bool,
     /// What was executed, as it said when it came again.
     executed_again: Option<Vector>,
     /// No stand-in may come any more.
@@ -81,6 +83,8 @@ pub(crate) struct Judge {
     /// Those before, and whether their episodes had begun. The first was not dropped for certain; all others may have turned stale on
     /// the way, and so may the newest, so that each of them may still be the newest to the controller.
     previous: Vec<(Newest, bool)>,
+    /// What messages since the last action that got none say was executed.
+    unanswered_executed: Vec<Vector>,
     last: Option<Action>,
     /// `last` belongs to the running episode.
     in_episode: bool,
@@ -120,6 +124,7 @@ impl Judge {
             running: vec![running],
             newest: None,
             previous: Vec::new(),
+            unanswered_executed: Vec::new(),
             last: None,
             in_episode: false,
             is_held: false,

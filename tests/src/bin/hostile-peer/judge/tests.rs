@@ -260,6 +260,34 @@ fn a_new_beginning_is_believed_where_a_message_may_have_been_dropped_or_decided_
 }
 
 #[test]
+fn a_message_that_was_overtaken_is_what_is_gone_on_from_where_the_newer_one_is_dropped_or_refused() {
+    let stand_in = |polled, sequence, now_ns| {
+        after_one(setup(), |judge| {
+            hear(judge, &message(2));
+            let mut newer = message(5);
+            newer.scheduled_ns = at_ns(2);
+            judge.received(Heard::new(1, &newer, at_ns(4)), polled);
+            judge.looks_at_link(at_ns(4) + 1, false);
+            send(judge, action(sequence, ActionSource::Imagined, 0.1), now_ns);
+        })
+    };
+    assert_eq!(stand_in(true, 3, at_ns(4)), None);
+    assert_eq!(stand_in(true, 4, at_ns(4)), Some("stand-in"), "too early");
+    assert_eq!(stand_in(false, 3, at_ns(4)), Some("stand-in"), "2 waits for its answer");
+    let held = |value| {
+        after_one(Setup { rate_max: Some(0.1), ..setup() }, |judge| {
+            let (mut overtaken, mut refused) = (message(2), message(3));
+            overtaken.executed_action = [0.4; ACTION_LEN];
+            refused.executed_action = [3e38; ACTION_LEN];
+            hear(judge, &overtaken);
+            judge.received(Heard::new(1, &refused, at_ns(3)), true);
+            send(judge, action(3, ActionSource::Fallback, value), at_ns(3));
+        })
+    };
+    assert_eq!((held(0.4), held(0.25)), (None, Some("rate")));
+}
+
+#[test]
 fn a_fallback_may_stand_in_for_a_message_that_has_turned_stale_and_its_answer_come_later() {
     let answered = |stale_at_ns, values: [f32; 2]| {
         after_one(setup(), |judge| {

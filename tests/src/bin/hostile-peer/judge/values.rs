@@ -18,6 +18,7 @@ impl Judge {
             bases.push(newest.heard.executed);
         }
         bases.extend(newest.executed_again);
+        bases.extend(&self.unanswered_executed);
         let rests = self.running.iter().any(|running| !running.is_absolute);
         if rests && starts && (newest.heard.flags.contains(ObservationFlags::FIRST) || bases.is_empty()) {
             bases.push([0.0; ACTION_LEN]);
