@@ -305,9 +305,6 @@ pub enum OnnxError {
 /// Reads an ONNX file and checks that it is self-contained: standard operators only, no external data, no control flow, no
 /// sparse weights, no local functions. What it holds is counted first ([`Amounts`]): decoding a file takes little more memory than
 /// the file itself.
-///
-/// # Errors
-/// See [`OnnxError`].
 pub fn parse_self_contained(bytes: &[u8]) -> Result<Model, OnnxError> {
     Amounts::check(bytes)?;
     let model = Model::decode(bytes)?;

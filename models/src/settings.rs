@@ -184,9 +184,6 @@ pub enum SettingsError {
 const SETTINGS_BYTES_MAX: u64 = 1 << 20;
 
 /// Reads settings from a TOML file; unknown keys are refused.
-///
-/// # Errors
-/// See [`SettingsError`].
 pub fn read<T: DeserializeOwned>(path: &Path) -> Result<T, SettingsError> {
     let bytes = crate::files::read_capped(path, SETTINGS_BYTES_MAX)?;
     let text = String::from_utf8(bytes)

@@ -81,9 +81,6 @@ pub struct Snapshots {
 
 impl Snapshots {
     /// Starts writing.
-    ///
-    /// # Errors
-    /// See [`SnapshotError`].
     pub fn start(settings: SnapshotSettings) -> Result<Self, SnapshotError> {
         let io = |source| SnapshotError::Io { path: settings.file.clone(), source };
         let file = OpenOptions::new().create(true).append(true).open(&settings.file).map_err(io)?;

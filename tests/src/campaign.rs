@@ -58,9 +58,6 @@ pub fn on_threads(count: u64, work: impl Fn() -> anyhow::Result<()> + Sync) -> a
 }
 
 /// Writes a report as JSON, where a file was named.
-///
-/// # Errors
-/// Those of writing.
 pub fn write_json(path: Option<&Path>, report: &impl Serialize) -> anyhow::Result<()> {
     let Some(path) = path else { return Ok(()) };
     let mut json = serde_json::to_vec_pretty(report).context("writing the report")?;

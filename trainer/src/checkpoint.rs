@@ -147,9 +147,6 @@ impl Checkpoint {
 
     /// The same with every weight rounded to the nearest that 16 bits hold: half the size for who ships it, and what is exported of it
     /// compresses to half.
-    ///
-    /// # Errors
-    /// Those of candle.
     pub fn rounded(&self) -> Result<Self, CheckpointError> {
         let round = |(name, var): (&str, &candle_core::Var)| {
             Ok((name.to_owned(), var.to_dtype(DType::F16)?.to_dtype(DType::F32)?))
@@ -229,9 +226,6 @@ impl Checkpoint {
 
     /// Reads a checkpoint, of a run the newest ([`Checkpoint::locate`]): exactly the parameters that its settings ask for, of their
     /// shapes, all finite.
-    ///
-    /// # Errors
-    /// See [`CheckpointError`].
     pub fn read(path: &Path, device: &Device) -> Result<Self, CheckpointError> {
         let folder = Self::locate(path)?;
         let stored = || std::fs::read(folder.join(SETTINGS_FILE)).ok();

@@ -205,9 +205,6 @@ fn said_of(error: &toml::de::Error, text: &str) -> String {
 
 impl Manifest {
     /// Checks everything that can be checked without reading another file.
-    ///
-    /// # Errors
-    /// See [`BundleError`].
     pub fn check(&self) -> Result<(), BundleError> {
         self.model.validate()?;
         if self.model.kind != ModelKind::Rcwm {

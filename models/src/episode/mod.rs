@@ -162,9 +162,6 @@ impl Episode {
     }
 
     /// Reads a `.npz` file; every array's size is checked before it is unpacked.
-    ///
-    /// # Errors
-    /// See [`EpisodeError`].
     pub fn read(path: &Path) -> Result<Self, EpisodeError> {
         let bytes = read_capped(path, EPISODE_BYTES_MAX)?;
         npz::read(path, &bytes)
@@ -187,17 +184,11 @@ impl Episode {
     }
 
     /// Whether a `.npz` file has disturbed pictures; the pictures themselves are not read.
-    ///
-    /// # Errors
-    /// See [`EpisodeError`].
     pub fn is_disturbed(path: &Path) -> Result<bool, EpisodeError> {
         npz::has(path, npz::DISTURBED)
     }
 
     /// Writes a compressed `.npz` file atomically.
-    ///
-    /// # Errors
-    /// See [`EpisodeError`].
     pub fn write(&self, path: &Path) -> Result<(), EpisodeError> {
         Ok(write_atomic(path, &self.to_bytes(path)?)?)
     }

@@ -71,9 +71,6 @@ struct Runner {
 
 /// Runs every case for `ticks` ticks after a tenth of them, at most 2000, unmeasured. With `real_time`, the calling thread and the ticks' second
 /// threads get a fixed priority and the process locked memory, as far as the system grants it. `go_on` is asked after every round.
-///
-/// # Errors
-/// See [`BenchError`].
 pub fn bench(
     bundle: &Bundle,
     cases: &[Case],
@@ -161,9 +158,6 @@ pub struct Measured {
 
 impl Measured {
     /// Writes what was asked for: a folder of percentile files a case, and the cases' ticks as lines of one plot.
-    ///
-    /// # Errors
-    /// See [`PlotError`].
     pub fn write(&self, files: &LatencyFiles) -> Result<(), PlotError> {
         if let Some(folder) = &files.hgrm {
             for (case, telemetry) in &self.runs {

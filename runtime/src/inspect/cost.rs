@@ -40,9 +40,6 @@ pub struct Cost {
 
 impl Cost {
     /// Counts a part.
-    ///
-    /// # Errors
-    /// See [`CostError`].
     pub fn of(bytes: &[u8]) -> Result<Self, CostError> {
         let graph = onnx::parse_self_contained(bytes)?.graph.ok_or(OnnxError::NoGraph)?;
         let shapes = shapes(bytes).map_err(CostError::Shapes)?;

@@ -119,9 +119,6 @@ pub struct Recorder {
 
 impl Recorder {
     /// Starts recording the first `episodes_max` episodes into a folder, which is made where it is missing.
-    ///
-    /// # Errors
-    /// See [`RecordError`].
     pub fn start(
         folder: &Path,
         episodes_max: u64,

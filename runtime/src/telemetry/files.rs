@@ -32,9 +32,6 @@ impl LatencyFiles {
     }
 
     /// Writes what was asked for; `period_us` is a line in the plot.
-    ///
-    /// # Errors
-    /// See [`PlotError`].
     pub fn write(&self, telemetry: &Telemetry, title: &str, period_us: Option<f64>) -> Result<(), PlotError> {
         if let Some(folder) = &self.hgrm {
             telemetry.write_hgrm(folder)?;

@@ -16,9 +16,6 @@ const NS_PER_US: f64 = 1e3;
 
 impl Telemetry {
     /// Writes `STAGE.hgrm` of every stage that has recorded anything into a folder, which is made where it is missing.
-    ///
-    /// # Errors
-    /// [`FileError`].
     pub fn write_hgrm(&self, folder: &Path) -> Result<Vec<PathBuf>, FileError> {
         std::fs::create_dir_all(folder)
             .map_err(|source| FileError::Io { path: folder.to_path_buf(), source })?;

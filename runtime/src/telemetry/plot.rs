@@ -77,9 +77,6 @@ type Chart<'a, 'b> = ChartContext<'a, BitMapBackend<'b>, Cartesian2d<RangedCoord
 type Failed = DrawingAreaErrorKind<<BitMapBackend<'static> as DrawingBackend>::ErrorType>;
 
 /// Draws latency by percentile into a PNG file; `period_us` is a dashed line across.
-///
-/// # Errors
-/// See [`PlotError`].
 pub fn plot(path: &Path, title: &str, curves: &[Curve<'_>], period_us: Option<f64>) -> Result<(), PlotError> {
     static KNOWN: OnceLock<bool> = OnceLock::new();
     if !KNOWN.get_or_init(|| register_font(FAMILY, FontStyle::Normal, FONT).is_ok()) {

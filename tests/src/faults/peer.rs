@@ -58,9 +58,6 @@ pub struct Served {
 }
 
 /// Serves one long episode until `stop` is set or the fault has hit so many times, then closes.
-///
-/// # Errors
-/// [`LinkError`].
 pub fn serve(
     settings: LinkSettings,
     period: Duration,

@@ -74,18 +74,12 @@ impl Learner {
     }
 
     /// Sets a parameter, a moment or the average, in the trainer's order of numbers.
-    ///
-    /// # Errors
-    /// [`GpuError::Failed`].
     pub fn set(&mut self, array: Array, at: usize, values: &[f32]) -> Result<(), GpuError> {
         let Self { machine, weights, .. } = self;
         weights.set(machine, array, &weights.entries()[at], values)
     }
 
     /// The numbers of a parameter, a gradient, a moment or the average.
-    ///
-    /// # Errors
-    /// [`GpuError::Failed`].
     pub fn get(&mut self, array: Array, at: usize) -> Result<Vec<f32>, GpuError> {
         let Self { machine, weights, .. } = self;
         weights.get(machine, array, &weights.entries()[at])
@@ -97,18 +91,12 @@ impl Learner {
     }
 
     /// The returns' running range, to be set when a run is resumed.
-    ///
-    /// # Errors
-    /// [`GpuError::Failed`].
     pub fn set_range(&mut self, range: [f64; 2]) -> Result<(), GpuError> {
         let address = address(self.room.range);
         self.machine.upload(address, &range.map(|x| x as f32))
     }
 
     /// Puts images, and masks where the settings store them, at places `from` and on of the store.
-    ///
-    /// # Errors
-    /// [`GpuError::Failed`].
     pub fn store(&mut self, from: usize, images: &[u8], masks: &[u8]) -> Result<(), GpuError> {
         let image = 64 * 64 * 3;
         let count = images.len() / image;
@@ -128,9 +116,6 @@ impl Learner {
 
     /// One update of the world model. `rate` is each parameter's learning rate, by name. The running average follows by the batch's number.
     /// Where a loss or a gradient is not finite, nothing moves.
-    ///
-    /// # Errors
-    /// [`GpuError::Failed`].
     pub fn update_world(
         &mut self,
         batch: &Batch<'_>,
@@ -157,9 +142,6 @@ impl Learner {
     }
 
     /// The world model's losses of a batch; nothing moves.
-    ///
-    /// # Errors
-    /// [`GpuError::Failed`].
     pub fn validate_world(&mut self, batch: &Batch<'_>, noise: Noise) -> Result<WorldValues, GpuError> {
         self.upload(batch, noise)?;
         self.machine.run(&self.programs.validation)?;
@@ -208,9 +190,6 @@ impl Learner {
 
     /// How long the parts of the last updates' programs take, run command by command: world model, then behaviour. Moves the parameters as
     /// an update does.
-    ///
-    /// # Errors
-    /// [`GpuError::Failed`].
     pub fn time_parts(&mut self) -> Result<(Vec<PartTime>, Vec<PartTime>), GpuError> {
         let world = self.machine.time_parts(&self.programs.world)?;
         let behaviour = self.programs.behaviour.as_ref().map(|program| self.machine.time_parts(program));
@@ -218,9 +197,6 @@ impl Learner {
     }
 
     /// How long each kind of command takes by itself: world model, then behaviour. The weights are worth nothing afterwards.
-    ///
-    /// # Errors
-    /// [`GpuError::Failed`].
     pub fn time_commands(&mut self) -> Result<(Vec<CommandTime>, Vec<CommandTime>), GpuError> {
         let world = self.machine.time_commands(&self.programs.world)?;
         let behaviour = self.programs.behaviour.as_ref().map(|program| self.machine.time_commands(program));
@@ -234,9 +210,6 @@ impl Learner {
     }
 
     /// The posterior states of the last batch [T B, state], time-major.
-    ///
-    /// # Errors
-    /// [`GpuError::Failed`].
     pub fn features(&mut self) -> Result<Vec<f32>, GpuError> {
         let mut features = vec![0.0; self.room.features.len()];
         self.machine.download(address(self.room.features), &mut features)?;
@@ -244,9 +217,6 @@ impl Learner {
     }
 
     /// The KL of the robot's branch (0) or the environment's (1) in the last batch, before it is clipped [T B], time-major.
-    ///
-    /// # Errors
-    /// [`GpuError::Failed`].
     pub fn kl(&mut self, branch: usize) -> Result<Vec<f32>, GpuError> {
         let rows = self.settings.sizes.rows();
         let mut kl = vec![0.0; rows];

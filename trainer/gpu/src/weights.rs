@@ -193,9 +193,6 @@ impl Weights {
     }
 
     /// Sets a parameter in one of the arrays from numbers in the trainer's order.
-    ///
-    /// # Errors
-    /// [`GpuError::Failed`].
     pub fn set(
         &self,
         machine: &mut Machine,
@@ -210,9 +207,6 @@ impl Weights {
     }
 
     /// The numbers of a parameter in one of the arrays, in the trainer's order.
-    ///
-    /// # Errors
-    /// [`GpuError::Failed`].
     pub fn get(&self, machine: &mut Machine, array: Array, entry: &Entry) -> Result<Vec<f32>, GpuError> {
         let mut here = vec![0.0; entry.numbers()];
         machine.download(self.arrays[array as usize] + 4 * entry.offset as u64, &mut here)?;

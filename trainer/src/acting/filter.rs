@@ -7,9 +7,6 @@ use crate::model::world::{World, normalised_action};
 
 /// The posterior states [K, ...] after `images` (u8 [K, 64, 64, 3]), from the states before them and the actions that led there
 /// [K, action]: one step of [`World::observe`] whose carried state is given.
-///
-/// # Errors
-/// Those of candle.
 pub fn filter_step(
     world: &World,
     previous: &State,

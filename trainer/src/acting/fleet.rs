@@ -84,9 +84,6 @@ pub struct Fleet {
 
 impl Fleet {
     /// Starts a simulator for every launch and joins those that run already.
-    ///
-    /// # Errors
-    /// See [`FleetError`].
     pub fn new(launches: &[Launch], join: &[String]) -> Result<Self, FleetError> {
         let mut clients = Vec::new();
         // All load at the same time.
@@ -134,9 +131,6 @@ impl Fleet {
     }
 
     /// Answers an observation.
-    ///
-    /// # Errors
-    /// See [`FleetError`].
     pub fn answer(&mut self, to: &Gathered, action: [f32; ACTION_LEN]) -> Result<(), FleetError> {
         match &mut self.members[to.simulator].client {
             Some(client) => Ok(client.answer(to.observation.sequence, action)?),

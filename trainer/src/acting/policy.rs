@@ -44,9 +44,6 @@ impl Policy {
     }
 
     /// Decides for all simulators that show something, in one batch.
-    ///
-    /// # Errors
-    /// Those of candle.
     pub fn decide(&mut self, seen: &[PolicyInput<'_>], sampler: &mut Sampler) -> Result<Vec<Decision>> {
         if seen.is_empty() {
             return Ok(Vec::new());

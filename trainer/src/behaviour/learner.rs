@@ -111,9 +111,6 @@ impl BehaviourLearner {
     }
 
     /// Moves the slow critic towards the critic.
-    ///
-    /// # Errors
-    /// Those of candle.
     pub fn mix_slow_critic(&self) -> candle_core::Result<()> {
         let share = self.settings.slow_critic_share;
         for (name, slow) in self.parameters.iter() {
@@ -125,18 +122,12 @@ impl BehaviourLearner {
     }
 
     /// Imagines with the actor, keeping the graph.
-    ///
-    /// # Errors
-    /// Those of candle.
     pub fn imagine(&self, start: &State, sampler: &mut Sampler) -> candle_core::Result<Imagination> {
         imagine(&self.acting, start, &self.settings.horizon, sampler)
     }
 
     /// The same by all threads, each with some of the starts: their imaginations, in the starts' order. Rows know nothing of each other, so
     /// no thread waits for another.
-    ///
-    /// # Errors
-    /// Those of candle.
     pub fn imagine_shares(
         &self,
         start: &State,
@@ -156,9 +147,6 @@ impl BehaviourLearner {
     }
 
     /// Takes the returns of all shares into the range, then gives losses and gradients of actor and critic.
-    ///
-    /// # Errors
-    /// See [`LearningError`].
     pub fn gradients(&mut self, imagined: Vec<Imagination>) -> Result<BehaviourGradients, LearningError> {
         let mut range = self.return_range;
         let returns: Vec<_> = imagined.iter().map(|share| &share.returns).collect();
@@ -218,17 +206,11 @@ impl BehaviourLearner {
     }
 
     /// The critic's loss, in which the critic alone trains.
-    ///
-    /// # Errors
-    /// Those of candle.
     pub fn critic_loss(&self, imagined: &Imagination) -> candle_core::Result<Tensor> {
         critic_loss(&self.judging.critic, &self.judging.slow_critic, imagined)
     }
 
     /// Moves actor and critic.
-    ///
-    /// # Errors
-    /// Those of candle.
     pub fn apply(&mut self, gradients: &BehaviourGradients) -> candle_core::Result<()> {
         self.actor_adam.step(&self.parameters, &gradients.actor)?;
         self.critic_adam.step(&self.parameters, &gradients.critic)

@@ -5,9 +5,6 @@ use crate::model::heads::TwoHotHead;
 
 /// The actor's loss (eq. 11): `-mean(w_t ((R_t - v(s_t)) / scale + eta H_t))` over the first L-1 states. The gradient passes
 /// through the returns and through the values, back through the dynamics to the actions.
-///
-/// # Errors
-/// Those of candle.
 pub fn actor_loss(imagined: &Imagination, scale: f64, entropy_scale: f64) -> Result<Tensor> {
     let steps = imagined.returns.dim(0)?;
     let advantage = ((&imagined.returns - imagined.value.narrow(0, 0, steps)?)? / scale)?; // [L-1, N, 1]
@@ -17,9 +14,6 @@ pub fn actor_loss(imagined: &Imagination, scale: f64, entropy_scale: f64) -> Res
 
 /// The critic's loss (eq. 12): cross-entropy of its prediction with the returns, plus the same with what its slow copy predicts,
 /// over the first L-1 states.
-///
-/// # Errors
-/// Those of candle.
 pub fn critic_loss(critic: &TwoHotHead, slow: &TwoHotHead, imagined: &Imagination) -> Result<Tensor> {
     let steps = imagined.returns.dim(0)?;
     let features = imagined.features.narrow(0, 0, steps)?.detach();

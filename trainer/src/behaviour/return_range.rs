@@ -15,9 +15,6 @@ pub struct ReturnRange {
 
 impl ReturnRange {
     /// Takes in a batch of returns of any shape.
-    ///
-    /// # Errors
-    /// Those of candle.
     pub fn update(&mut self, returns: &Tensor, settings: &BehaviourSettings) -> Result<()> {
         let mut sorted = returns.flatten_all()?.to_vec1::<f32>()?;
         sorted.sort_by(f32::total_cmp);

@@ -20,9 +20,6 @@ pub fn lambda_return(reward: &Tensor, value: &Tensor, discount: &Tensor, lambda:
 }
 
 /// The cumulative product of the discounts before each state, [L, N, 1]; 1 for the start. Without gradient.
-///
-/// # Errors
-/// Those of candle.
 pub fn step_weights(discount: &Tensor) -> Result<Tensor> {
     let discount = discount.detach();
     let mut weight = discount.get(0)?.ones_like()?;

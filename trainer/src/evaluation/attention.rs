@@ -57,9 +57,6 @@ pub struct AttentionFilm {
 
 impl AttentionFilm {
     /// Imagines the first of the trajectories after `context` steps; none for a model without interaction.
-    ///
-    /// # Errors
-    /// Those of candle.
     pub fn of(
         agent: &Agent,
         task: &TaskTrajectories,
@@ -110,9 +107,6 @@ impl AttentionFilm {
 
     /// A picture: time goes right, one imagined step in `every` and the last one are shown; below the pictures the map, a column for
     /// each categorical of the environment's z, a row for each row that answers it.
-    ///
-    /// # Errors
-    /// Those of writing words.
     pub fn strip(&self, every: usize) -> Result<RgbImage, PlotError> {
         let last = self.maps.len() - 1;
         let mut shown: Vec<usize> = (0..last).step_by(every.max(1)).collect();
@@ -141,9 +135,6 @@ impl AttentionFilm {
     }
 
     /// Writes the strip as PNG.
-    ///
-    /// # Errors
-    /// Those of drawing and writing.
     pub fn write_strip(&self, every: usize, path: &Path) -> Result<(), PlotError> {
         write_png(&self.strip(every)?, path)
     }

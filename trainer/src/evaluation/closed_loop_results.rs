@@ -35,9 +35,6 @@ pub struct ClosedLoopResults {
 
 impl ClosedLoopResults {
     /// Reads a file of results; also gives its bytes, for a checksum.
-    ///
-    /// # Errors
-    /// See [`ClosedLoopResultsError`].
     pub fn read(path: &Path) -> Result<(Self, Vec<u8>), ClosedLoopResultsError> {
         let bytes = read_capped(path, BYTES_MAX)?;
         let results = serde_json::from_slice(&bytes)

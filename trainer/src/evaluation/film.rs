@@ -33,9 +33,6 @@ pub struct Film {
 
 impl Film {
     /// The film of one row of a batch: `truth` u8 [B, T, 64, 64, 3] and what was decoded of the same steps.
-    ///
-    /// # Errors
-    /// Those of candle.
     pub fn of(truth: &Tensor, decoded: &Decoded, row: usize, context: usize) -> candle_core::Result<Self> {
         let one = |x: &Tensor| x.get(row);
         let branches =
@@ -60,9 +57,6 @@ impl Film {
     }
 
     /// A picture with a row a panel; time goes right, one step in `every` is shown, and what was imagined is framed.
-    ///
-    /// # Errors
-    /// Those of writing words.
     pub fn strip(&self, every: usize) -> Result<RgbImage, PlotError> {
         let shown: Vec<usize> = (0..self.steps.len()).step_by(every.max(1)).collect();
         let panels = self.panels();
@@ -86,9 +80,6 @@ impl Film {
     }
 
     /// The frames of a film, a step each, with the panels side by side.
-    ///
-    /// # Errors
-    /// Those of writing words.
     pub fn frames(&self) -> Result<Vec<RgbImage>, PlotError> {
         let panels = self.panels();
         let width = panels as u32 * (CELL + GAP) + GAP;
@@ -109,17 +100,11 @@ impl Film {
     }
 
     /// Writes the strip as PNG, with one step in `every`.
-    ///
-    /// # Errors
-    /// Those of drawing and writing.
     pub fn write_strip(&self, every: usize, path: &Path) -> Result<(), PlotError> {
         write_png(&self.strip(every)?, path)
     }
 
     /// Writes the film as GIF.
-    ///
-    /// # Errors
-    /// Those of drawing and writing.
     pub fn write_gif(&self, path: &Path) -> Result<(), PlotError> {
         write_gif(&self.frames()?, STEP_CS, path)
     }

@@ -149,9 +149,6 @@ impl Trace {
 
 /// Measures states of the steps from `from` on, [B, L, ...], and what was decoded of them, against the truth of a batch with masks:
 /// a trace a row.
-///
-/// # Errors
-/// Those of candle.
 pub fn traces(
     agent: &Agent,
     batch: &Batch,

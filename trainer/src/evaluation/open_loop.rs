@@ -6,9 +6,6 @@ use crate::model::world::World;
 
 /// Posterior states of the first `context` steps, then states imagined with the recorded actions from the last of them: every
 /// tensor [B, T, ...]. Only the context's images are looked at.
-///
-/// # Errors
-/// Those of candle.
 pub fn open_loop(world: &World, batch: &Batch, context: usize, sampler: &mut Sampler) -> Result<State> {
     let context = context.clamp(1, batch.first.length());
     let seen = filtered(world, batch, context, sampler)?;
@@ -20,9 +17,6 @@ pub fn open_loop(world: &World, batch: &Batch, context: usize, sampler: &mut Sam
 }
 
 /// Posterior states of the first `steps` steps, [B, steps, ...]; every sequence begins an episode for the model.
-///
-/// # Errors
-/// Those of candle.
 pub fn filtered(world: &World, batch: &Batch, steps: usize, sampler: &mut Sampler) -> Result<State> {
     let rows = batch.first.batch();
     let embeds = world.encode(&batch.image.narrow(1, 0, steps)?.contiguous()?)?;
@@ -33,9 +27,6 @@ pub fn filtered(world: &World, batch: &Batch, steps: usize, sampler: &mut Sample
 
 /// States imagined with the recorded actions of the steps from `context` on, [B, T - context, ...], from the posterior
 /// state before them. `posteriors` are those of the first `context` steps or more.
-///
-/// # Errors
-/// Those of candle.
 pub fn imagined(
     world: &World,
     batch: &Batch,
@@ -49,9 +40,6 @@ pub fn imagined(
 }
 
 /// Two stretches of states [B, ..., ...] after each other.
-///
-/// # Errors
-/// Those of candle.
 pub fn joined(before: &State, after: &State) -> Result<State> {
     let join = |a: &Tensor, b: &Tensor| Tensor::cat(&[a, b], 1);
     let branches = before.branches.iter().zip(&after.branches).map(|(a, b)| {

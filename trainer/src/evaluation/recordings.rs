@@ -27,9 +27,6 @@ pub struct Recordings {
 
 impl Recordings {
     /// Reads those of a folder's episodes that have masks; `read` is called after each.
-    ///
-    /// # Errors
-    /// See [`LoadError`].
     pub fn load(folder: &Folder, mut read: impl FnMut()) -> Result<Self, LoadError> {
         let mut recordings = Self::default();
         for episode in folder.episodes() {

@@ -41,9 +41,6 @@ impl OtherActions {
     }
 
     /// The actions of the steps from `context` on, [B, L, action], that take the place of a batch's.
-    ///
-    /// # Errors
-    /// Those of candle.
     pub fn of(self, batch: &Batch, context: usize) -> Result<Tensor> {
         let (motion, steps) = (ACTION_LEN - 1, batch.first.length() - context);
         let recorded = batch.action.narrow(1, context, steps)?;
@@ -172,9 +169,6 @@ impl Response {
 
 /// Compares what was imagined of the steps from `context` on by the recorded actions and by others, both [B, L, ...]. Of each row the
 /// first `steps` count, context included.
-///
-/// # Errors
-/// Those of candle.
 pub fn differences(
     batch: &Batch,
     recorded: &Decoded,

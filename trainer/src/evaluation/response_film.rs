@@ -27,9 +27,6 @@ pub struct ResponseFilm {
 
 impl ResponseFilm {
     /// The film of one row of a batch: `truth` u8 [B, T, 64, 64, 3], and what was imagined of its first `steps` steps but the context's.
-    ///
-    /// # Errors
-    /// Those of candle.
     pub fn of(
         truth: &Tensor,
         (recorded, imagined): (&Decoded, &Decoded),
@@ -64,9 +61,6 @@ impl ResponseFilm {
     }
 
     /// The frames of a film, an imagined step each.
-    ///
-    /// # Errors
-    /// Those of writing words.
     pub fn frames(&self) -> Result<Vec<RgbImage>, PlotError> {
         let labels = self.labels();
         let left = widest(labels.iter())? + 2 * GAP;
@@ -98,9 +92,6 @@ impl ResponseFilm {
     }
 
     /// A picture with a row a panel; time goes right, one imagined step in `every` and the last one are shown.
-    ///
-    /// # Errors
-    /// Those of writing words.
     pub fn strip(&self, every: usize) -> Result<RgbImage, PlotError> {
         let last = self.steps.len().saturating_sub(1);
         let shown: Vec<usize> = (0..last).step_by(every.max(1)).chain([last]).collect();
@@ -132,17 +123,11 @@ impl ResponseFilm {
     }
 
     /// Writes the strip as PNG, with one step in `every`.
-    ///
-    /// # Errors
-    /// Those of drawing and writing.
     pub fn write_strip(&self, every: usize, path: &Path) -> Result<(), PlotError> {
         write_png(&self.strip(every)?, path)
     }
 
     /// Writes the film as GIF.
-    ///
-    /// # Errors
-    /// Those of drawing and writing.
     pub fn write_gif(&self, path: &Path) -> Result<(), PlotError> {
         write_gif(&self.frames()?, STEP_CS, path)
     }

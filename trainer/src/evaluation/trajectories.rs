@@ -172,9 +172,6 @@ impl TaskTrajectories {
     }
 
     /// Trajectories `from` to `to` as a batch with masks. The last step of an episode is repeated where a shorter trajectory needs it.
-    ///
-    /// # Errors
-    /// Those of candle.
     pub fn batch(&self, from: usize, to: usize, device: &Device) -> Result<Batch, EvaluationError> {
         let mut batch = HostBatch { rows: to - from, length: self.length, ..HostBatch::default() };
         for Trajectory { episode, start, .. } in &self.chosen[from..to] {

@@ -121,9 +121,6 @@ impl GpuLearner {
     }
 
     /// Sets the weights or their average.
-    ///
-    /// # Errors
-    /// [`LearningError`].
     pub fn load(&mut self, array: Array, parameters: &Parameters) -> Result<(), LearningError> {
         for at in 0..self.learner.weights().entries().len() {
             let name = self.learner.weights().entries()[at].name.clone();
@@ -135,9 +132,6 @@ impl GpuLearner {
     }
 
     /// Goes on with an optimiser's moments.
-    ///
-    /// # Errors
-    /// [`LearningError`].
     pub fn resume(&mut self, adam: &Adam) -> Result<(), LearningError> {
         for at in 0..self.learner.weights().entries().len() {
             let Some(moments) = adam.moments().get(&self.learner.weights().entries()[at].name) else {
@@ -151,17 +145,11 @@ impl GpuLearner {
     }
 
     /// Goes on with the returns' running range.
-    ///
-    /// # Errors
-    /// [`LearningError`].
     pub fn resume_range(&mut self, range: ReturnRange) -> Result<(), LearningError> {
         Ok(self.learner.set_range([range.low, range.high])?)
     }
 
     /// Brings the weights, or their average, to `parameters`.
-    ///
-    /// # Errors
-    /// [`LearningError`].
     pub fn write_back(&mut self, array: Array, parameters: &Parameters) -> Result<(), LearningError> {
         for at in 0..self.learner.weights().entries().len() {
             let name = self.learner.weights().entries()[at].name.clone();
@@ -173,9 +161,6 @@ impl GpuLearner {
     }
 
     /// The optimiser of the world model, the actor or the critic as it is now.
-    ///
-    /// # Errors
-    /// [`LearningError`].
     pub fn adam(&mut self, group: Group, parameters: &Parameters) -> Result<Adam, LearningError> {
         let mut all = BTreeMap::new();
         for at in 0..self.learner.weights().entries().len() {
@@ -200,9 +185,6 @@ impl GpuLearner {
     }
 
     /// Puts an episode's images, and its masks where they are stored, from `place` on.
-    ///
-    /// # Errors
-    /// [`LearningError`].
     pub fn store(&mut self, place: u32, episode: &Episode) -> Result<(), LearningError> {
         let images: Vec<u8> = episode.image.iter().copied().collect();
         let masks: Vec<u8> = episode.robot_mask.iter().flatten().map(|robot| u8::from(*robot)).collect();
@@ -219,9 +201,6 @@ impl GpuLearner {
     }
 
     /// The same, with the images where `images` says, shifted row by row.
-    ///
-    /// # Errors
-    /// Those of [`GpuLearner::update_world`].
     pub fn update_world_from(
         &mut self,
         batch: &HostBatch,
@@ -242,9 +221,6 @@ impl GpuLearner {
     }
 
     /// The world model's losses of a batch.
-    ///
-    /// # Errors
-    /// [`LearningError`].
     pub fn validate_world(
         &mut self,
         batch: &HostBatch,

@@ -72,18 +72,12 @@ impl Adam {
     }
 
     /// Moves every parameter that has a gradient by one step of the settings' learning rate.
-    ///
-    /// # Errors
-    /// Those of candle.
     pub fn step(&mut self, parameters: &Parameters, gradients: &Gradients) -> Result<()> {
         let rate = self.settings.learning_rate;
         self.step_at(parameters, gradients, |_| rate)
     }
 
     /// Moves every parameter that has a gradient by one step of its own learning rate.
-    ///
-    /// # Errors
-    /// Those of candle.
     pub fn step_at(
         &mut self,
         parameters: &Parameters,

@@ -17,9 +17,6 @@ pub enum CloningLoss {
 }
 
 /// The mean distance of the actor from `actions` [N, action] in the states of `features` [N, state width]: a scalar.
-///
-/// # Errors
-/// Those of candle.
 pub fn cloning_loss(actor: &Actor, features: &Tensor, actions: &Tensor, loss: CloningLoss) -> Result<Tensor> {
     let policy = actor.forward(features)?;
     let error = (&policy.mean - actions)?;

@@ -101,17 +101,11 @@ impl Examples {
     }
 
     /// N.
-    ///
-    /// # Errors
-    /// Those of candle.
     pub fn count(&self) -> Result<usize> {
         self.features.dim(0)
     }
 
     /// Batch `number` of a seed: `rows` examples, each equally likely, as features and actions.
-    ///
-    /// # Errors
-    /// Those of candle.
     pub fn draw(&self, rows: usize, seed: u64, number: u64) -> Result<(Tensor, Tensor)> {
         let mut generator = ChaCha8Rng::seed_from_u64(seed);
         generator.set_stream(number);
@@ -187,9 +181,6 @@ pub fn actions_taken(episode: &Episode) -> impl Iterator<Item = (usize, [f32; AC
 
 /// The state that `features` [N, state width] were made of. What is known of its logits is where z has its classes: imagination never
 /// looks at those of its start.
-///
-/// # Errors
-/// Those of candle.
 pub fn state_of_features(features: &Tensor, model: &ModelSettings) -> Result<State> {
     let (n, m, d) = (model.categoricals, model.classes, model.deter);
     let branches = match model.kind {

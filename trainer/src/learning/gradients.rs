@@ -27,9 +27,6 @@ impl Gradients {
     }
 
     /// The same of a share of the loss, to be summed by [`Gradients::sum`].
-    ///
-    /// # Errors
-    /// Those of [`Gradients::of`].
     pub fn of_share(
         loss: &Tensor,
         parameters: &Parameters,
@@ -50,9 +47,6 @@ impl Gradients {
     }
 
     /// The sum over shares of a loss.
-    ///
-    /// # Errors
-    /// Those of [`Gradients::new`].
     pub fn sum(shares: Vec<BTreeMap<String, Tensor>>) -> Result<Self, LearningError> {
         let mut shares = shares.into_iter();
         let mut sum = shares.next().unwrap_or_default();
@@ -85,9 +79,6 @@ impl Gradients {
     }
 
     /// Those whose names `wanted` accepts, with their own norm.
-    ///
-    /// # Errors
-    /// Those of [`Gradients::new`].
     pub fn part(&self, wanted: fn(&str) -> bool) -> Result<Self, LearningError> {
         let chosen = self.tensors.iter().filter(|(name, _)| wanted(name));
         Self::new(chosen.map(|(name, tensor)| (name.clone(), tensor.clone())).collect())

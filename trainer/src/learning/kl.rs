@@ -28,9 +28,6 @@ impl BranchKl {
 }
 
 /// The balanced KL between a branch's posterior q and prior p (eq. 3), from their logits [B, T, n, m].
-///
-/// # Errors
-/// Those of candle.
 pub fn balanced_kl(
     posterior: &Latent,
     prior: &Latent,

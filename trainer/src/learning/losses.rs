@@ -55,9 +55,6 @@ pub struct LossValues {
 }
 
 /// The world model's losses of a batch (eq. 2, 3, 9).
-///
-/// # Errors
-/// Those of candle.
 pub fn world_losses(
     agent: &Agent,
     batch: &Batch,
@@ -148,9 +145,6 @@ impl WorldLosses {
     }
 
     /// The losses of a batch from those of shares of its rows, each with its share of the rows.
-    ///
-    /// # Errors
-    /// Those of candle.
     pub fn merged(shares: &[(f64, Self)]) -> Result<Self> {
         if let [(_, all)] = shares {
             return Ok(all.clone());
@@ -178,9 +172,6 @@ impl WorldLosses {
     }
 
     /// The plain numbers.
-    ///
-    /// # Errors
-    /// Those of candle.
     pub fn values(&self) -> Result<LossValues> {
         let scalar = |x: &Tensor| Ok::<_, candle_core::Error>(f64::from(x.to_scalar::<f32>()?));
         let kl =

@@ -93,9 +93,6 @@ impl WorldLearner {
     }
 
     /// The losses of a batch, with the graph they are differentiated through.
-    ///
-    /// # Errors
-    /// Those of candle.
     pub fn losses(&self, batch: &Batch, sampler: &mut Sampler) -> candle_core::Result<WorldLosses> {
         self.losses_of_share(batch, examples_a_row(batch), sampler)
     }
@@ -165,9 +162,6 @@ impl WorldLearner {
     }
 
     /// Moves the parameters.
-    ///
-    /// # Errors
-    /// Those of candle.
     pub fn apply(&mut self, gradients: &Gradients) -> candle_core::Result<()> {
         let rate = self.settings.adam.learning_rate;
         let environment = self.settings.environment_learning_rate;

@@ -26,9 +26,6 @@ pub struct Agent {
 
 impl Agent {
     /// An agent on the parameters of `scope`.
-    ///
-    /// # Errors
-    /// Those of [`Scope::get`].
     pub fn new(scope: &Scope<'_>, settings: &ModelSettings) -> Result<Self, ParameterError> {
         Ok(Self {
             settings: settings.clone(),
@@ -42,9 +39,6 @@ impl Agent {
 }
 
 /// Every parameter of an agent of these sizes.
-///
-/// # Errors
-/// [`ParameterError::Tensor`].
 pub fn specs(settings: &ModelSettings) -> Result<Vec<ParameterSpec>, ParameterError> {
     let recorder = Recorder::default();
     Agent::new(&recorder.scope(), settings)?;
@@ -52,9 +46,6 @@ pub fn specs(settings: &ModelSettings) -> Result<Vec<ParameterSpec>, ParameterEr
 }
 
 /// Fresh parameters of an agent of these sizes; the same seed gives the same weights.
-///
-/// # Errors
-/// [`ParameterError::Tensor`].
 pub fn initialise(
     settings: &ModelSettings,
     seed: u64,
@@ -73,9 +64,6 @@ pub struct Part {
 }
 
 /// The parts of an agent, in the order of the data, with their numbers of parameters.
-///
-/// # Errors
-/// [`ParameterError::Tensor`].
 pub fn parts(settings: &ModelSettings) -> Result<Vec<Part>, ParameterError> {
     let mut parts: Vec<Part> = Vec::new();
     for spec in specs(settings)? {

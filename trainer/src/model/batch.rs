@@ -28,9 +28,6 @@ impl Observed {
     }
 
     /// Rows after rows.
-    ///
-    /// # Errors
-    /// Those of candle.
     pub fn cat(shares: &[&Self]) -> Result<Self> {
         let states = |field: fn(&Self) -> &State| {
             State::cat(&shares.iter().map(|share| field(share).clone()).collect::<Vec<_>>())
@@ -54,9 +51,6 @@ pub struct Decoded {
 }
 
 /// `a / max(1, |a|)`: actions beyond the limits count as the limits. The divisor gets no gradient.
-///
-/// # Errors
-/// Those of candle.
 pub fn normalised_action(action: &Tensor) -> Result<Tensor> {
     action / action.detach().abs()?.maximum(1.0)?
 }

@@ -43,9 +43,6 @@ pub struct Branch {
 
 impl Branch {
     /// A branch whose input layer takes `input` values and whose posterior takes `embed` values of the image.
-    ///
-    /// # Errors
-    /// Those of [`Scope::get`].
     pub fn new(scope: &Scope<'_>, settings: &ModelSettings, input: usize, embed: usize) -> Built<Self> {
         let (d, hidden) = (settings.deter, settings.hidden);
         let cell = scope.at("cell");
@@ -66,9 +63,6 @@ impl Branch {
     }
 
     /// The learned state an episode starts from: `h_0 = tanh(w)`, `z_0` = mode of the prior at `h_0`; every tensor [B, ...].
-    ///
-    /// # Errors
-    /// Those of candle.
     pub fn initial(&self, batch: usize) -> Result<Latent> {
         let h = self.initial.tanh()?; // [1, d]
         let logits = self.prior_logits(&h)?; // [1, n, m]
@@ -82,9 +76,6 @@ impl Branch {
     }
 
     /// One step of the recurrence (eq. 5, 6): `x` [B, input] and `h` [B, d] to h' [B, d].
-    ///
-    /// # Errors
-    /// Those of candle.
     pub fn recur(&self, x: &Tensor, h: &Tensor) -> Result<Tensor> {
         let x = self.input.forward(x)?; // [B, hidden]
         let gates = ops::linear(&Tensor::cat(&[&x, h], D::Minus1)?, &self.cell_weight, None)?; // [B, 3d]
@@ -92,26 +83,17 @@ impl Branch {
     }
 
     /// Logits of the prior `p(z_t | h_t)`: `h` [..., d] to [..., n, m].
-    ///
-    /// # Errors
-    /// Those of candle.
     pub fn prior_logits(&self, h: &Tensor) -> Result<Tensor> {
         self.to_latent_shape(&self.prior.logits.forward(&self.prior.dense.forward(h)?)?)
     }
 
     /// The image's share in the posterior's dense block: `embed` [..., E] to [..., hidden]. It does not depend on the
     /// recurrence, so a whole sequence is done at once.
-    ///
-    /// # Errors
-    /// Those of candle.
     pub fn embed_share(&self, embed: &Tensor) -> Result<Tensor> {
         ops::linear(embed, &self.posterior_columns[1], None)
     }
 
     /// Logits of the posterior `q(z_t | h_t, o_t)`: `h` [..., d] and the image's share [..., hidden] to [..., n, m].
-    ///
-    /// # Errors
-    /// Those of candle.
     pub fn posterior_logits(&self, h: &Tensor, embed_share: &Tensor) -> Result<Tensor> {
         let sum = (ops::linear(h, &self.posterior_columns[0], None)? + embed_share)?;
         let hidden = self.posterior.dense.finish(&sum)?;
@@ -119,18 +101,12 @@ impl Branch {
     }
 
     /// A latent drawn from `logits` [..., n, m].
-    ///
-    /// # Errors
-    /// Those of candle.
     pub fn draw(&self, logits: Tensor, h: &Tensor, sampler: &mut Sampler) -> Result<Latent> {
         let gumbel = sampler.gumbel(logits.dims(), logits.device())?;
         self.draw_with(logits, h, gumbel.as_ref())
     }
 
     /// A latent drawn with given Gumbel noise (none: the mode).
-    ///
-    /// # Errors
-    /// Those of candle.
     pub fn draw_with(&self, logits: Tensor, h: &Tensor, gumbel: Option<&Tensor>) -> Result<Latent> {
         let z = ops::straight_through_sample(&logits, self.unimix, gumbel)?;
         Ok(Latent { z, h: h.clone(), logits })

@@ -19,9 +19,6 @@ pub struct Picture {
 
 impl Picture {
     /// The image times the mask: this branch's contribution to the whole picture.
-    ///
-    /// # Errors
-    /// Those of candle.
     pub fn masked(&self) -> Result<Tensor> {
         self.image.broadcast_mul(&self.mask)
     }
@@ -39,9 +36,6 @@ pub struct Decoder {
 
 impl Decoder {
     /// `linear.*`, `0` to `2` `.conv.weight` and `.norm.*`, `3.conv.*`.
-    ///
-    /// # Errors
-    /// Those of [`Scope::get`].
     pub fn new(scope: &Scope<'_>, state: usize, depth: usize) -> Built<Self> {
         let channels = 8 * depth;
         let linear = Linear::output(&scope.at("linear"), state, 16 * channels, 1.0)?;
@@ -60,9 +54,6 @@ impl Decoder {
     }
 
     /// `state` [..., n*m + d] to a picture.
-    ///
-    /// # Errors
-    /// Those of candle.
     pub fn forward(&self, state: &Tensor) -> Result<Picture> {
         let x = self.raw(state)?;
         let image = x.narrow(D::Minus1, 0, 3)?;
@@ -71,9 +62,6 @@ impl Decoder {
 
     /// `state` [..., n*m + d] to the three image channels and the mask's logit, [..., 64, 64, 4], as
     /// [`picture_loss`](ops::picture_loss) takes them.
-    ///
-    /// # Errors
-    /// Those of candle.
     pub fn raw(&self, state: &Tensor) -> Result<Tensor> {
         let lead = &state.dims()[..state.rank() - 1];
         let x = ops::conv_up_stack(&self.first_map(state)?, &self.layers())?; // [N, 64, 64, 4]
@@ -82,9 +70,6 @@ impl Decoder {
     }
 
     /// The map that the convolutions start from: `state` [..., n*m + d] to [N, 4, 4, 8c].
-    ///
-    /// # Errors
-    /// Those of candle.
     pub fn first_map(&self, state: &Tensor) -> Result<Tensor> {
         self.linear.forward(state)?.reshape(((), 4, 4, self.channels))
     }

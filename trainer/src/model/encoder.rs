@@ -20,9 +20,6 @@ pub struct ConvStack {
 
 impl ConvStack {
     /// One layer for each step of `channels`: `i.conv.weight`, `i.norm.*`.
-    ///
-    /// # Errors
-    /// Those of [`Scope::get`].
     pub fn new(scope: &Scope<'_>, channels: &[usize]) -> Built<Self> {
         let layer = |(index, step): (usize, &[usize])| {
             let (input, out) = (step[0], step[1]);
@@ -35,9 +32,6 @@ impl ConvStack {
     }
 
     /// `x` [N, H, W, first channels] to [N, H/2^layers, W/2^layers, last channels].
-    ///
-    /// # Errors
-    /// Those of candle.
     pub fn forward(&self, x: &Tensor) -> Result<Tensor> {
         let layers: Vec<_> = self.layers.iter().map(|(weight, norm)| norm.after(weight)).collect();
         ops::conv_down_stack(x, &layers)
@@ -45,9 +39,6 @@ impl ConvStack {
 }
 
 /// Flattens [N, 4, 4, C] in (channel, row, column) order, as the posterior's weights expect it: [N, 16 C].
-///
-/// # Errors
-/// Those of candle.
 pub fn flatten_channels_first(x: &Tensor) -> Result<Tensor> {
     x.permute((0, 3, 1, 2))?.flatten_from(1)
 }

@@ -20,42 +20,27 @@ pub struct TwoHotHead {
 
 impl TwoHotHead {
     /// The last layer starts at 0, and so does every prediction.
-    ///
-    /// # Errors
-    /// Those of [`Scope::get`].
     pub fn new(scope: &Scope<'_>, settings: &ModelSettings) -> Built<Self> {
         let mlp = Mlp::new(scope, settings.state_width(), settings.units, settings.bins, 0.0)?;
         Ok(Self { mlp, bins: ops::bins_tensor(settings.bins, &scope.device())? })
     }
 
     /// Logits [..., bins] of `features` [..., state width].
-    ///
-    /// # Errors
-    /// Those of candle.
     pub fn logits(&self, features: &Tensor) -> Result<Tensor> {
         self.mlp.forward(features)
     }
 
     /// Cross-entropy of the prediction from `features` [..., state width] with the two-hot distributions of `values` [...]: [...].
-    ///
-    /// # Errors
-    /// Those of candle.
     pub fn loss(&self, features: &Tensor, values: &Tensor) -> Result<Tensor> {
         self.logits_loss(&self.logits(features)?, values)
     }
 
     /// [`TwoHotHead::loss`] of logits [..., bins].
-    ///
-    /// # Errors
-    /// Those of candle.
     pub fn logits_loss(&self, logits: &Tensor, values: &Tensor) -> Result<Tensor> {
         ops::two_hot_loss(logits, &self.bins, &ops::symlog(&values.detach())?)
     }
 
     /// Mean of the distribution given by logits [..., bins]: [..., 1].
-    ///
-    /// # Errors
-    /// Those of candle.
     pub fn mean(&self, logits: &Tensor) -> Result<Tensor> {
         ops::two_hot_mean(logits, &self.bins)
     }
@@ -71,9 +56,6 @@ pub struct Heads {
 
 impl Heads {
     /// `reward.*` and `continue.*`.
-    ///
-    /// # Errors
-    /// Those of [`Scope::get`].
     pub fn new(scope: &Scope<'_>, settings: &ModelSettings) -> Built<Self> {
         let reward = TwoHotHead::new(&scope.at("reward"), settings)?;
         let continues = Mlp::new(&scope.at("continue"), settings.state_width(), settings.units, 1, 1.0)?;
@@ -81,17 +63,11 @@ impl Heads {
     }
 
     /// Logit [..., 1] of the probability that the episode goes on.
-    ///
-    /// # Errors
-    /// Those of candle.
     pub fn continue_logit(&self, features: &Tensor) -> Result<Tensor> {
         self.continues.forward(features)
     }
 
     /// The probability itself.
-    ///
-    /// # Errors
-    /// Those of candle.
     pub fn continue_probability(&self, features: &Tensor) -> Result<Tensor> {
         ops::sigmoid(&self.continue_logit(features)?)
     }
@@ -114,18 +90,12 @@ pub struct ActionDistribution {
 
 impl Actor {
     /// `0.*`, `1.*`, `out.*`.
-    ///
-    /// # Errors
-    /// Those of [`Scope::get`].
     pub fn new(scope: &Scope<'_>, settings: &ModelSettings) -> Built<Self> {
         let mlp = Mlp::new(scope, settings.state_width(), settings.units, 2 * settings.action, 1.0)?;
         Ok(Self { mlp })
     }
 
     /// The distribution of actions in a state: `mean = tanh(.)`, `std = 0.9 sigmoid(. + 2) + 0.1`.
-    ///
-    /// # Errors
-    /// Those of candle.
     pub fn forward(&self, features: &Tensor) -> Result<ActionDistribution> {
         let out = self.mlp.forward(features)?; // [..., 2 * action]
         let action = out.dim(D::Minus1)? / 2;
@@ -137,9 +107,6 @@ impl Actor {
 
 impl ActionDistribution {
     /// A sample with a gradient, divided back into [-1, 1]; the mean for [`Sampler::Mode`].
-    ///
-    /// # Errors
-    /// Those of candle.
     pub fn sample(&self, sampler: &mut Sampler) -> Result<Tensor> {
         match sampler.normal(self.mean.dims(), self.mean.device())? {
             None => Ok(self.mean.clone()),
@@ -148,9 +115,6 @@ impl ActionDistribution {
     }
 
     /// Differential entropy, summed over the components: [...].
-    ///
-    /// # Errors
-    /// Those of candle.
     pub fn entropy(&self) -> Result<Tensor> {
         let constant = 0.5 * (2.0 * PI * E).ln();
         (self.std.log()? + constant)?.sum(D::Minus1)

@@ -26,9 +26,6 @@ pub struct Interaction {
 
 impl Interaction {
     /// `deter`, `query`, `key`, `value`, `output`, `norm`.
-    ///
-    /// # Errors
-    /// Those of [`Scope::get`].
     pub fn new(scope: &Scope<'_>, settings: &ModelSettings) -> Built<Self> {
         let (d, m) = (settings.deter, settings.classes);
         let linear = |name: &str, width: usize| {
@@ -48,9 +45,6 @@ impl Interaction {
 
     /// The interaction features e_{t-1} [B, n, m] and the attention map [B, n, n+k], from the robot's prior z_t [B, n, m],
     /// its h_t [B, d] and the environment's z_{t-1} [B, n, m].
-    ///
-    /// # Errors
-    /// Those of candle.
     pub fn forward(
         &self,
         robot_prior_z: &Tensor,
@@ -63,9 +57,6 @@ impl Interaction {
     }
 
     /// What the environment receives from the robot, x = W_o softmax(Q K^T / sqrt(m)) V [B, n, m], and the attention map, from the same.
-    ///
-    /// # Errors
-    /// Those of candle.
     pub fn attend(
         &self,
         robot_prior_z: &Tensor,

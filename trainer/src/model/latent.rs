@@ -21,25 +21,16 @@ pub struct Latent {
 
 impl Latent {
     /// `[z, h]`: [..., n*m + d].
-    ///
-    /// # Errors
-    /// Those of candle.
     pub fn features(&self) -> Result<Tensor> {
         Tensor::cat(&[&self.z.flatten_from(self.z.rank() - 2)?, &self.h], D::Minus1)
     }
 
     /// Applies the same operation to z, h and logits.
-    ///
-    /// # Errors
-    /// Those of `op`.
     pub fn map(&self, op: impl Fn(&Tensor) -> Result<Tensor>) -> Result<Self> {
         Ok(Self { z: op(&self.z)?, h: op(&self.h)?, logits: op(&self.logits)? })
     }
 
     /// Latents side by side along a new dimension.
-    ///
-    /// # Errors
-    /// Those of candle.
     pub fn stack<'a>(latents: impl Iterator<Item = &'a Self>, dim: usize) -> Result<Self> {
         Self::join(latents, |tensors| Tensor::stack(tensors, dim))
     }
@@ -65,18 +56,12 @@ pub struct State {
 
 impl State {
     /// `s = [z^R, h^R, z^E, h^E]`: [..., state width].
-    ///
-    /// # Errors
-    /// Those of candle.
     pub fn features(&self) -> Result<Tensor> {
         let branches = self.branches.iter().map(Latent::features).collect::<Result<Vec<_>>>()?;
         Tensor::cat(&branches, D::Minus1)
     }
 
     /// Applies the same operation to every tensor.
-    ///
-    /// # Errors
-    /// Those of `op`.
     pub fn map(&self, op: impl Fn(&Tensor) -> Result<Tensor>) -> Result<Self> {
         let branches = self.branches.iter().map(|branch| branch.map(&op)).collect::<Result<_>>()?;
         Ok(Self { branches })
@@ -102,17 +87,11 @@ impl State {
     }
 
     /// States side by side along a new dimension.
-    ///
-    /// # Errors
-    /// Those of candle.
     pub fn stack(states: &[Self], dim: usize) -> Result<Self> {
         Self::join(states, |tensors| Tensor::stack(tensors, dim))
     }
 
     /// States one after the other along their first dimension.
-    ///
-    /// # Errors
-    /// Those of candle.
     pub fn cat(states: &[Self]) -> Result<Self> {
         Self::join(states, |tensors| Tensor::cat(tensors, 0))
     }
@@ -182,9 +161,6 @@ impl FirstSteps {
     }
 
     /// What step `t` carries over from step `t - 1`; the first step of a sequence carries nothing.
-    ///
-    /// # Errors
-    /// Those of candle.
     pub fn carry(&self, t: usize, device: &Device) -> Result<Carry> {
         let column: Vec<bool> = self.flags.iter().skip(t).step_by(self.length).copied().collect();
         if t == 0 || column.iter().all(|first| *first) {
@@ -201,9 +177,6 @@ impl FirstSteps {
 
 impl Carry {
     /// `initial` where an episode begins, else `carried`; both [B, ...].
-    ///
-    /// # Errors
-    /// Those of candle.
     pub fn select(&self, initial: &Tensor, carried: &Tensor) -> Result<Tensor> {
         match self {
             Self::All => Ok(carried.clone()),
@@ -218,9 +191,6 @@ impl Carry {
     }
 
     /// The initial state where an episode begins, else the carried one.
-    ///
-    /// # Errors
-    /// Those of candle.
     pub fn select_state(&self, initial: &State, carried: &State) -> Result<State> {
         let pairs = initial.branches.iter().zip(&carried.branches);
         let branches = pairs.map(|(initial, carried)| {
@@ -289,17 +259,11 @@ impl Sampler {
     }
 
     /// Standard Gumbel noise of this shape; none for the mode.
-    ///
-    /// # Errors
-    /// Those of candle.
     pub fn gumbel(&mut self, shape: &[usize], device: &Device) -> Result<Option<Tensor>> {
         self.draw(shape, device, 1, ops::gumbel)
     }
 
     /// Standard normal noise of this shape; none for the mean.
-    ///
-    /// # Errors
-    /// Those of candle.
     pub fn normal(&mut self, shape: &[usize], device: &Device) -> Result<Option<Tensor>> {
         self.draw(shape, device, 2, ops::normal)
     }

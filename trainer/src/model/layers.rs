@@ -19,26 +19,17 @@ pub struct Norm {
 
 impl Norm {
     /// `weight` and `bias` [width].
-    ///
-    /// # Errors
-    /// Those of [`Scope::get`].
     pub fn new(scope: &Scope<'_>, width: usize, eps: f64) -> Built<Self> {
         let weight = scope.get("weight", &[width], Init::Ones)?;
         Ok(Self { weight, bias: scope.get("bias", &[width], Init::Zeros)?, eps })
     }
 
     /// LayerNorm of `x` [..., width].
-    ///
-    /// # Errors
-    /// Those of candle.
     pub fn forward(&self, x: &Tensor) -> Result<Tensor> {
         ops::layer_norm(x, &self.weight, &self.bias, self.eps)
     }
 
     /// LayerNorm, then `SiLU`.
-    ///
-    /// # Errors
-    /// Those of candle.
     pub fn silu(&self, x: &Tensor) -> Result<Tensor> {
         ops::layer_norm_silu(x, &self.weight, &self.bias, self.eps)
     }
@@ -50,9 +41,6 @@ impl Norm {
     }
 
     /// The recurrent cell's update of `h` [..., d] from its linear layer's output `pre` [..., 3d].
-    ///
-    /// # Errors
-    /// Those of candle.
     pub fn cell(&self, pre: &Tensor, h: &Tensor) -> Result<Tensor> {
         ops::recurrent_cell(pre, &self.weight, &self.bias, self.eps, h)
     }
@@ -67,26 +55,17 @@ pub struct Linear {
 
 impl Linear {
     /// An output layer: uniform start of this scale.
-    ///
-    /// # Errors
-    /// Those of [`Scope::get`].
     pub fn output(scope: &Scope<'_>, input: usize, out: usize, scale: f64) -> Built<Self> {
         Self::new(scope, input, out, Init::Uniform { fans: input + out, scale })
     }
 
     /// `weight` [out, input] and `bias` [out].
-    ///
-    /// # Errors
-    /// Those of [`Scope::get`].
     pub fn new(scope: &Scope<'_>, input: usize, out: usize, init: Init) -> Built<Self> {
         let weight = scope.get("weight", &[out, input], init)?;
         Ok(Self { weight, bias: scope.get("bias", &[out], Init::Zeros)? })
     }
 
     /// `x` [..., input] to [..., out].
-    ///
-    /// # Errors
-    /// Those of candle.
     pub fn forward(&self, x: &Tensor) -> Result<Tensor> {
         ops::linear(x, &self.weight, Some(&self.bias))
     }
@@ -101,9 +80,6 @@ pub struct Dense {
 
 impl Dense {
     /// `linear.weight` [out, input], `norm.*` [out].
-    ///
-    /// # Errors
-    /// Those of [`Scope::get`].
     pub fn new(scope: &Scope<'_>, input: usize, out: usize) -> Built<Self> {
         let init = Init::TruncatedNormal { fans: input + out };
         let weight = scope.at("linear").get("weight", &[out, input], init)?;
@@ -111,26 +87,17 @@ impl Dense {
     }
 
     /// `x` [..., input] to [..., out].
-    ///
-    /// # Errors
-    /// Those of candle.
     pub fn forward(&self, x: &Tensor) -> Result<Tensor> {
         self.norm.silu(&ops::linear(x, &self.weight, None)?)
     }
 
     /// Weights [out, width] of columns `[from, from + width)` of the input, by which they have their share in the sum before the
     /// normalisation: parts of an input that are known early can be multiplied early, and for many steps at once.
-    ///
-    /// # Errors
-    /// Those of candle.
     pub fn columns(&self, from: usize, width: usize) -> Result<Tensor> {
         self.weight.narrow(1, from, width)
     }
 
     /// The block's output from the summed shares of [`Dense::columns`].
-    ///
-    /// # Errors
-    /// Those of candle.
     pub fn finish(&self, sum: &Tensor) -> Result<Tensor> {
         self.norm.silu(sum)
     }
@@ -145,18 +112,12 @@ pub struct Mlp {
 
 impl Mlp {
     /// `0.*`, `1.*`, `out.*`; the output layer starts uniform of scale `out_scale`.
-    ///
-    /// # Errors
-    /// Those of [`Scope::get`].
     pub fn new(scope: &Scope<'_>, input: usize, units: usize, out: usize, out_scale: f64) -> Built<Self> {
         let blocks = [Dense::new(&scope.at(0), input, units)?, Dense::new(&scope.at(1), units, units)?];
         Ok(Self { blocks, out: Linear::output(&scope.at("out"), units, out, out_scale)? })
     }
 
     /// `x` [..., input] to [..., out].
-    ///
-    /// # Errors
-    /// Those of candle.
     pub fn forward(&self, x: &Tensor) -> Result<Tensor> {
         let x = self.blocks[1].forward(&self.blocks[0].forward(x)?)?;
         self.out.forward(&x)

@@ -80,9 +80,6 @@ pub struct Parameters {
 impl Parameters {
     /// Fresh parameters. Each is drawn from its own stream of the seed, named by the parameter: the same seed gives the same
     /// weights whatever else the model has. The slow critic starts as a copy of the critic.
-    ///
-    /// # Errors
-    /// [`ParameterError::Tensor`].
     pub fn initialise(specs: &[ParameterSpec], seed: u64, device: &Device) -> Result<Self, ParameterError> {
         let mut vars = BTreeMap::new();
         for spec in specs {
@@ -94,9 +91,6 @@ impl Parameters {
     }
 
     /// Parameters with given values: exactly the names and shapes of `specs`, all finite.
-    ///
-    /// # Errors
-    /// See [`ParameterError`].
     pub fn from_tensors(
         specs: &[ParameterSpec],
         mut tensors: BTreeMap<String, Tensor>,
@@ -142,9 +136,6 @@ impl Parameters {
     }
 
     /// Parameters of their own with the same values.
-    ///
-    /// # Errors
-    /// [`ParameterError::Tensor`].
     pub fn copied(&self) -> Result<Self, ParameterError> {
         let copy = |(name, var): (&String, &Var)| {
             Ok((name.clone(), Var::from_tensor(&var.as_detached_tensor().copy()?)?))
@@ -186,9 +177,6 @@ impl Parameters {
 }
 
 /// Moves `var` towards `goal` by this share of the way.
-///
-/// # Errors
-/// Those of candle.
 pub fn mix(var: &Var, goal: &Var, share: f64) -> candle_core::Result<()> {
     let mixed = ((goal.as_detached_tensor() * share)? + (var.as_detached_tensor() * (1.0 - share))?)?;
     var.set(&mixed)

@@ -33,9 +33,6 @@ pub struct Rcwm {
 
 impl Rcwm {
     /// Parts `encoder.*`, `robot.*`, `interaction.*`, `environment.*`, `decoder.*`.
-    ///
-    /// # Errors
-    /// Those of [`Scope::get`].
     pub fn new(scope: &Scope<'_>, settings: &ModelSettings) -> Built<Self> {
         let (c, nm) = (settings.cnn_depth, settings.stoch_width());
         let encoder = scope.at("encoder");
@@ -52,60 +49,39 @@ impl Rcwm {
     }
 
     /// Embeddings of u8 images [N, 64, 64, 3], robot's and environment's: [N, 16*4c] each.
-    ///
-    /// # Errors
-    /// Those of candle.
     pub fn encode(&self, images: &Tensor) -> Result<Vec<Tensor>> {
         let features = self.features(images)?;
         (0..2).map(|branch| self.embed(branch, &features)).collect()
     }
 
     /// Features of u8 images [N, 64, 64, 3] that both branches see: [N, 16, 16, 2c].
-    ///
-    /// # Errors
-    /// Those of candle.
     pub fn features(&self, images: &Tensor) -> Result<Tensor> {
         self.shared_encoder.forward(&image_to_float(images)?)
     }
 
     /// One branch's embedding [N, 16*4c] of features [N, 16, 16, 2c].
-    ///
-    /// # Errors
-    /// Those of candle.
     pub fn embed(&self, branch: usize, features: &Tensor) -> Result<Tensor> {
         flatten_channels_first(&self.encoders[branch].forward(features)?)
     }
 
     /// The learned state an episode starts from.
-    ///
-    /// # Errors
-    /// Those of candle.
     pub fn initial(&self, batch: usize) -> Result<State> {
         let branches = self.branches.iter().map(|branch| branch.initial(batch)).collect::<Result<_>>()?;
         Ok(State { branches })
     }
 
     /// Robot h_t [B, d] from its z_{t-1}, h_{t-1} and the action a_{t-1} [B, action] (eq. 5, 6 left).
-    ///
-    /// # Errors
-    /// Those of candle.
     pub fn recur_robot(&self, previous: &Latent, action: &Tensor) -> Result<Tensor> {
         let x = Tensor::cat(&[&previous.z.flatten_from(1)?, &normalised_action(action)?], 1)?;
         self.branches[ROBOT].recur(&x, &previous.h)
     }
 
     /// Environment h_t [B, d] from e_{t-1} [B, n, m] and its h_{t-1} (eq. 5, 6 right). It never sees the action.
-    ///
-    /// # Errors
-    /// Those of candle.
     pub fn recur_environment(&self, e: &Tensor, h: &Tensor) -> Result<Tensor> {
         self.branches[ENVIRONMENT].recur(&e.flatten_from(1)?, h)
     }
 
     /// Filters a batch of sequences: `embeds` [B, T, E] per branch, `actions` [B, T, action], each the one that led to its image.
-    ///
-    /// # Errors
-    /// Those of candle.
     pub fn observe(
         &self,
         embeds: &[Tensor],
@@ -154,17 +130,11 @@ impl Rcwm {
     }
 
     /// One imagined step: the state after `action` [B, action], drawn from the priors.
-    ///
-    /// # Errors
-    /// Those of candle.
     pub fn imagine_step(&self, state: &State, action: &Tensor, sampler: &mut Sampler) -> Result<State> {
         self.attend_step(state, action, sampler).map(|(state, _)| state)
     }
 
     /// The same, with the attention map [B, n, n+k] of the interaction that led to it.
-    ///
-    /// # Errors
-    /// Those of candle.
     pub fn attend_step(
         &self,
         state: &State,
@@ -182,9 +152,6 @@ impl Rcwm {
     }
 
     /// Both branches' pictures and their sum (eq. 8).
-    ///
-    /// # Errors
-    /// Those of candle.
     pub fn decode(&self, state: &State) -> Result<Decoded> {
         let pairs = self.decoders.iter().zip(&state.branches);
         let pictures = pairs

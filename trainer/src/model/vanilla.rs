@@ -22,9 +22,6 @@ pub struct Vanilla {
 
 impl Vanilla {
     /// Parts `encoder.*`, `dynamics.*`, `decoder.*`.
-    ///
-    /// # Errors
-    /// Those of [`Scope::get`].
     pub fn new(scope: &Scope<'_>, settings: &ModelSettings) -> Built<Self> {
         let (c, input) = (settings.cnn_depth, settings.stoch_width() + settings.action);
         Ok(Self {
@@ -35,17 +32,11 @@ impl Vanilla {
     }
 
     /// The embedding [N, 16*8c] of u8 images [N, 64, 64, 3].
-    ///
-    /// # Errors
-    /// Those of candle.
     pub fn encode(&self, images: &Tensor) -> Result<Vec<Tensor>> {
         Ok(vec![flatten_channels_first(&self.encoder.forward(&image_to_float(images)?)?)?])
     }
 
     /// The learned state an episode starts from.
-    ///
-    /// # Errors
-    /// Those of candle.
     pub fn initial(&self, batch: usize) -> Result<State> {
         Ok(State { branches: vec![self.branch.initial(batch)?] })
     }
@@ -56,9 +47,6 @@ impl Vanilla {
     }
 
     /// Filters a batch of sequences: `embeds` [B, T, E], `actions` [B, T, action], each the one that led to its image.
-    ///
-    /// # Errors
-    /// Those of candle.
     pub fn observe(
         &self,
         embeds: &[Tensor],
@@ -88,18 +76,12 @@ impl Vanilla {
     }
 
     /// One imagined step: the state after `action` [B, action], drawn from the prior.
-    ///
-    /// # Errors
-    /// Those of candle.
     pub fn imagine_step(&self, state: &State, action: &Tensor, sampler: &mut Sampler) -> Result<State> {
         let h = self.recur(&state.branches[0], action)?;
         Ok(State { branches: vec![self.branch.draw(self.branch.prior_logits(&h)?, &h, sampler)?] })
     }
 
     /// The image, and the mask that is predicted beside it.
-    ///
-    /// # Errors
-    /// Those of candle.
     pub fn decode(&self, state: &State) -> Result<Decoded> {
         let picture = self.decoder.forward(&state.branches[0].features()?)?;
         Ok(Decoded { image: picture.image.clone(), pictures: vec![picture] })

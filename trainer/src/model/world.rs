@@ -21,9 +21,6 @@ pub enum World {
 
 impl World {
     /// The model that the settings name.
-    ///
-    /// # Errors
-    /// Those of [`Scope::get`].
     pub fn new(scope: &Scope<'_>, settings: &ModelSettings) -> Built<Self> {
         Ok(match settings.kind {
             ModelKind::Rcwm => Self::Rcwm(Box::new(Rcwm::new(scope, settings)?)),
@@ -32,9 +29,6 @@ impl World {
     }
 
     /// Embeddings of u8 images [B, T, 64, 64, 3], one per branch: [B, T, E].
-    ///
-    /// # Errors
-    /// Those of candle.
     pub fn encode(&self, images: &Tensor) -> Result<Vec<Tensor>> {
         let (batch, length) = (images.dim(0)?, images.dim(1)?);
         let images = images.flatten(0, 1)?; // [B*T, 64, 64, 3]
@@ -46,9 +40,6 @@ impl World {
     }
 
     /// The learned state an episode starts from, [B, ...].
-    ///
-    /// # Errors
-    /// Those of candle.
     pub fn initial(&self, batch: usize) -> Result<State> {
         match self {
             Self::Rcwm(model) => model.initial(batch),
@@ -57,9 +48,6 @@ impl World {
     }
 
     /// Filters a batch of sequences: `embeds` [B, T, E] per branch, `actions` [B, T, action], each the one that led to its image.
-    ///
-    /// # Errors
-    /// Those of candle.
     pub fn observe(
         &self,
         embeds: &[Tensor],
@@ -74,9 +62,6 @@ impl World {
     }
 
     /// One imagined step: the state after `action` [B, action], drawn from the priors.
-    ///
-    /// # Errors
-    /// Those of candle.
     pub fn imagine_step(&self, state: &State, action: &Tensor, sampler: &mut Sampler) -> Result<State> {
         match self {
             Self::Rcwm(model) => model.imagine_step(state, action, sampler),
@@ -85,9 +70,6 @@ impl World {
     }
 
     /// Imagines with given actions [B, L, action] from a state [B, ...]: the L states after them, [B, L, ...].
-    ///
-    /// # Errors
-    /// Those of candle.
     pub fn imagine(&self, start: &State, actions: &Tensor, sampler: &mut Sampler) -> Result<State> {
         let actions = sequence(actions)?; // [L, B, action]
         let mut states: Vec<State> = Vec::with_capacity(actions.dim(0)?);
@@ -100,9 +82,6 @@ impl World {
 
     /// [`World::imagine`], with the interaction's attention maps [B, L, n, n+k]; none in the vanilla baseline, which has no
     /// interaction.
-    ///
-    /// # Errors
-    /// Those of candle.
     pub fn imagine_attending(
         &self,
         start: &State,
@@ -123,9 +102,6 @@ impl World {
 
     /// Squared errors of a state's picture, [N], and of the robot's mask if the true one is given: [`ops::picture_loss`] of
     /// [`World::decode`], at a fraction of its cost. `images` are u8 [..., 64, 64, 3], `masks` [..., 64, 64] of 0 and 1.
-    ///
-    /// # Errors
-    /// Those of candle.
     pub fn picture_loss(
         &self,
         state: &State,
@@ -147,9 +123,6 @@ impl World {
     }
 
     /// The pictures of a state [..., ...].
-    ///
-    /// # Errors
-    /// Those of candle.
     pub fn decode(&self, state: &State) -> Result<Decoded> {
         match self {
             Self::Rcwm(model) => model.decode(state),

@@ -11,9 +11,6 @@ use rcwm_kernels::{batch::math, vectorised};
 /// `1 / (1 + exp(-x))`: no overflow and no NaN gradient for any x.
 ///
 /// Cost a number: 15 flops and 8 bytes forward, 20 flops and 12 bytes backward.
-///
-/// # Errors
-/// Those of candle (shapes, devices).
 pub fn sigmoid(x: &Tensor) -> Result<Tensor> {
     if fusible(&[x]) && x.rank() > 0 { rows::apply(x, x.shape(), Sigmoid) } else { composite::sigmoid(x) }
 }
@@ -21,17 +18,11 @@ pub fn sigmoid(x: &Tensor) -> Result<Tensor> {
 /// Softmax over the last dimension.
 ///
 /// Cost a number: 25 flops and 8 bytes forward, 30 flops and 12 bytes backward.
-///
-/// # Errors
-/// Those of candle (shapes, devices).
 pub fn softmax(x: &Tensor) -> Result<Tensor> {
     distribution(x, 0.0, Output::Probabilities).unwrap_or_else(|| composite::softmax(x))
 }
 
 /// Logarithm of the softmax over the last dimension. Cost as [`softmax`].
-///
-/// # Errors
-/// Those of candle (shapes, devices).
 pub fn log_softmax(x: &Tensor) -> Result<Tensor> {
     distribution(x, 0.0, Output::Logarithms).unwrap_or_else(|| composite::log_softmax(x))
 }

@@ -28,9 +28,6 @@ pub struct AdamStep {
 /// Moves `var` and its moments by one step, in place: `var -= rate * m / (1 - b1^t) / (sqrt(v / (1 - b2^t)) + eps)`.
 ///
 /// Cost a number: 28 bytes and 15 flops.
-///
-/// # Errors
-/// Those of candle (shapes, devices).
 pub fn adam_step(var: &Var, mean: &Var, square: &Var, grad: &Tensor, step: &AdamStep) -> Result<()> {
     let kernel = Kernel::new(step);
     if fusible(&[var, mean, square, grad]) {
@@ -41,9 +38,6 @@ pub fn adam_step(var: &Var, mean: &Var, square: &Var, grad: &Tensor, step: &Adam
 }
 
 /// Sum of squares of all numbers of a tensor, in f64. Cost a number: 2 flops and 4 bytes.
-///
-/// # Errors
-/// Those of candle.
 pub fn sum_of_squares(x: &Tensor) -> Result<f64> {
     if fusible(&[x]) {
         let x = x.contiguous()?;

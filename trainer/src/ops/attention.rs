@@ -9,9 +9,6 @@ use rcwm_kernels::batch::attention::{self, Sizes};
 /// `queries` [B, n, m], `keys` and `values` [B, r, m]; gives the mixture [B, n, m] and the attention map [B, n, r].
 ///
 /// Cost: `4 B n r m` flops forward, `10 B n r m` backward, and a softmax of `B n r` numbers.
-///
-/// # Errors
-/// Those of candle (shapes, devices).
 pub fn cross_attention(queries: &Tensor, keys: &Tensor, values: &Tensor) -> Result<(Tensor, Tensor)> {
     if !fusible(&[queries, keys, values]) {
         return composite::cross_attention(queries, keys, values);

@@ -13,17 +13,11 @@ pub use super::composite::one_hot_of_best;
 /// Class probabilities with a share of the uniform distribution mixed in: `(1 - u) softmax(logits) + u / m`.
 ///
 /// Cost a number: 25 flops and 8 bytes forward, 30 flops and 12 bytes backward.
-///
-/// # Errors
-/// Those of candle (shapes, devices).
 pub fn probs(logits: &Tensor, unimix: f64) -> Result<Tensor> {
     distribution(logits, unimix, Output::Probabilities).unwrap_or_else(|| composite::probs(logits, unimix))
 }
 
 /// Logarithm of [`probs`]. Cost: 20 flops a number more.
-///
-/// # Errors
-/// Those of candle (shapes, devices).
 pub fn log_probs(logits: &Tensor, unimix: f64) -> Result<Tensor> {
     distribution(logits, unimix, Output::Logarithms).unwrap_or_else(|| composite::log_probs(logits, unimix))
 }
@@ -34,9 +28,6 @@ pub fn log_probs(logits: &Tensor, unimix: f64) -> Result<Tensor> {
 /// sample is the most probable class.
 ///
 /// Cost a number: 45 flops and 12 bytes forward, 30 flops and 12 bytes backward.
-///
-/// # Errors
-/// Those of candle (shapes, devices).
 pub fn straight_through_sample(logits: &Tensor, unimix: f64, gumbel: Option<&Tensor>) -> Result<Tensor> {
     if !fusible(&[logits, gumbel.unwrap_or(logits)]) {
         return composite::straight_through_sample(logits, unimix, gumbel);
@@ -53,9 +44,6 @@ pub fn straight_through_sample(logits: &Tensor, unimix: f64, gumbel: Option<&Ten
 }
 
 /// The most probable class, with a gradient through the log-probabilities: `mode + log p - sg(log p)`.
-///
-/// # Errors
-/// Those of candle (shapes, devices).
 pub fn straight_through_mode(logits: &Tensor, unimix: f64) -> Result<Tensor> {
     if !fusible(&[logits]) {
         return composite::straight_through_mode(logits, unimix);
@@ -90,9 +78,6 @@ impl RowOp for StraightThrough {
 /// Entropy of the distribution of each row: `logits` [..., m] to [...].
 ///
 /// Cost a number: 45 flops and 4 bytes forward, 50 flops and 8 bytes backward.
-///
-/// # Errors
-/// Those of candle (shapes, devices).
 pub fn entropy(logits: &Tensor, unimix: f64) -> Result<Tensor> {
     if !fusible(&[logits]) {
         return composite::entropy(logits, unimix);
@@ -135,9 +120,6 @@ pub struct KlBalance {
 /// gradient; logits [..., n, m] of posterior q and prior p, results [...]. Divergences are summed over the n categoricals, then clipped.
 ///
 /// Cost a logit: 100 flops and 8 bytes forward, 130 flops and 16 bytes backward.
-///
-/// # Errors
-/// Those of candle (shapes, devices).
 pub fn balanced_kl(q: &Tensor, p: &Tensor, unimix: f64, balance: KlBalance) -> Result<(Tensor, Tensor)> {
     if q.dims() != p.dims() || q.rank() < 2 {
         return mismatch(OP_KL, q, p);

@@ -12,9 +12,6 @@ use rcwm_kernels::batch::norm::{Norm, NormGrads};
 /// `update = sigmoid(update - 1)`: a new cell keeps what it knows.
 ///
 /// Cost a number of h: 70 flops and 20 bytes forward, 90 and 36 backward.
-///
-/// # Errors
-/// Those of candle (shapes, devices).
 pub fn recurrent_update(gates: &Tensor, h: &Tensor) -> Result<Tensor> {
     if !fusible(&[gates, h]) {
         return composite::recurrent_update(gates, h);
@@ -33,9 +30,6 @@ pub fn recurrent_update(gates: &Tensor, h: &Tensor) -> Result<Tensor> {
 /// The recurrent cell after its linear layer: LayerNorm of `pre` [B, 3d], then [`recurrent_update`].
 ///
 /// Cost a number of h: 100 flops and 20 bytes forward, 180 and 40 backward.
-///
-/// # Errors
-/// Those of candle (shapes, devices).
 pub fn recurrent_cell(pre: &Tensor, weight: &Tensor, bias: &Tensor, eps: f64, h: &Tensor) -> Result<Tensor> {
     if !fusible(&[pre, weight, bias, h]) {
         return composite::recurrent_update(&composite::layer_norm(pre, weight, bias, eps)?, h);

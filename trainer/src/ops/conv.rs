@@ -19,18 +19,12 @@ pub fn conv_down(x: &Tensor, weight: &Tensor) -> Result<Tensor> {
 /// [B, 2H, 2W, out].
 ///
 /// Cost: `32 B H W C out` flops forward, half more where there are at most 4 outputs; twice that backward.
-///
-/// # Errors
-/// Those of candle (shapes, devices).
 pub fn conv_up(x: &Tensor, weight: &Tensor) -> Result<Tensor> {
     conv_up_stack(x, &[ConvLayer::bare(weight)])
 }
 
 /// [`conv_down`] layer after layer, with what follows each. An image goes through all layers while it is in the cache, and
 /// gradients between layers are never seen by candle.
-///
-/// # Errors
-/// Those of candle (shapes, devices).
 pub fn conv_down_stack(x: &Tensor, layers: &[ConvLayer<'_>]) -> Result<Tensor> {
     if layers.iter().all(|layer| fusible(&[x, layer.weight])) {
         return stack(Direction::Down, x, layers);
@@ -39,9 +33,6 @@ pub fn conv_down_stack(x: &Tensor, layers: &[ConvLayer<'_>]) -> Result<Tensor> {
 }
 
 /// [`conv_up`] layer after layer, as [`conv_down_stack`].
-///
-/// # Errors
-/// Those of candle (shapes, devices).
 pub fn conv_up_stack(x: &Tensor, layers: &[ConvLayer<'_>]) -> Result<Tensor> {
     if layers.iter().all(|layer| fusible(&[x, layer.weight])) {
         return stack(Direction::Up, x, layers);

@@ -75,9 +75,6 @@ impl Direction {
 const SHARE_NUMBERS_MIN: usize = 8_192;
 
 /// Applies the layers to `x` [B, H, W, C], f32 on the CPU.
-///
-/// # Errors
-/// Those of candle (shapes).
 pub fn stack(direction: Direction, x: &Tensor, layers: &[ConvLayer<'_>]) -> Result<Tensor> {
     let Applied { inputs, out, shape, kept } = apply(direction, x, layers)?;
     record_one(&inputs.iter().collect::<Vec<_>>(), out, shape, kept)
@@ -96,9 +93,6 @@ pub struct Applied {
 }
 
 /// Applies the layers without putting the result into candle's graph.
-///
-/// # Errors
-/// Those of candle (shapes).
 pub fn apply(direction: Direction, x: &Tensor, layers: &[ConvLayer<'_>]) -> Result<Applied> {
     let op = direction.name();
     let (batch, height, width, channels) = x.dims4()?;

@@ -9,9 +9,6 @@ use rcwm_kernels::batch::norm::add_rows;
 ///
 /// Cost: `2 rows in out` flops forward, twice that backward; the weights are read where they lie, also as a slice of the columns of a
 /// larger matrix.
-///
-/// # Errors
-/// Those of candle (shapes, devices).
 pub fn linear(x: &Tensor, weight: &Tensor, bias: Option<&Tensor>) -> Result<Tensor> {
     if fusible(&[x, weight, bias.unwrap_or(weight)]) {
         fused(x, weight, bias)

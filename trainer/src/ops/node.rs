@@ -24,9 +24,6 @@ pub trait Backward: Send + Sync {
 
     /// Gradients of the inputs, in their order; none where none is asked for (`wanted`) or where it is zero. `grads` are the outputs',
     /// none where nothing depends on an output.
-    ///
-    /// # Errors
-    /// Those of candle.
     fn backward(&self, grads: &[Option<Tensor>], wanted: &[bool]) -> Result<Vec<Option<Tensor>>>;
 }
 
@@ -103,9 +100,6 @@ pub fn mismatch<T>(op: &'static str, lhs: &Tensor, rhs: &Tensor) -> Result<T> {
 }
 
 /// Puts results into the graph: tensors of these numbers and shapes, whose gradients reach `inputs` through `op`.
-///
-/// # Errors
-/// Those of candle.
 pub fn record(
     inputs: &[&Tensor],
     outputs: Vec<(Vec<f32>, Shape)>,
@@ -153,9 +147,6 @@ pub fn record(
 }
 
 /// [`record`] for one output.
-///
-/// # Errors
-/// Those of candle.
 pub fn record_one(
     inputs: &[&Tensor],
     values: Vec<f32>,

@@ -11,9 +11,6 @@ pub(super) const SHARE_NUMBERS_MIN: usize = 32_768;
 /// LayerNorm over the last dimension, biased variance: `(x - mean) / sqrt(var + eps) * weight + bias`.
 ///
 /// Cost a number: 8 flops and 8 bytes forward, 20 flops and 12 bytes backward.
-///
-/// # Errors
-/// Those of candle (shapes, devices).
 pub fn layer_norm(x: &Tensor, weight: &Tensor, bias: &Tensor, eps: f64) -> Result<Tensor> {
     if fusible(&[x, weight, bias]) {
         fused("layer-norm", x, weight, bias, eps, false)
@@ -25,9 +22,6 @@ pub fn layer_norm(x: &Tensor, weight: &Tensor, bias: &Tensor, eps: f64) -> Resul
 /// LayerNorm, then `SiLU`: what follows every hidden layer.
 ///
 /// Cost a number: 25 flops and 8 bytes forward, 40 flops and 12 bytes backward.
-///
-/// # Errors
-/// Those of candle (shapes, devices).
 pub fn layer_norm_silu(x: &Tensor, weight: &Tensor, bias: &Tensor, eps: f64) -> Result<Tensor> {
     if fusible(&[x, weight, bias]) {
         fused("layer-norm-silu", x, weight, bias, eps, true)

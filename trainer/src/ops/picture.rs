@@ -6,9 +6,6 @@ use super::parallel;
 use rcwm_kernels::batch::picture::{self, Masks, RAW, Target};
 
 /// `x/255 - 0.5` of a u8 image, as f32; channels last. 5 bytes a number.
-///
-/// # Errors
-/// Those of candle.
 pub fn image_to_float(image: &Tensor) -> Result<Tensor> {
     if !matches!(image.device(), Device::Cpu) || image.dtype() != DType::U8 {
         return composite::image_to_float(image);
@@ -44,9 +41,6 @@ fn bytes(op: &'static str, x: &Tensor) -> Result<Vec<u8>> {
 /// `o_R m_R + o_E m_E`; of one (the vanilla baseline), its image alone. `image` is u8 [N, H, W, 3], `mask` [N, H, W] of 0 and 1.
 ///
 /// Cost a pixel: 60 flops and 40 bytes forward, 90 flops and 72 bytes backward.
-///
-/// # Errors
-/// Those of candle (shapes, devices).
 pub fn picture_loss(
     raws: &[&Tensor],
     image: &Tensor,

@@ -9,9 +9,6 @@ use super::{conv_up_stack, picture, picture_loss};
 ///
 /// As one op, because the pictures are by far the largest tensors of an update: nothing of their size, nor of their gradients', passes
 /// through candle. Cost: that of the parts.
-///
-/// # Errors
-/// Those of candle (shapes, devices).
 pub fn reconstruction_loss(
     stacks: &[(&Tensor, &[ConvLayer<'_>])],
     image: &Tensor,

@@ -26,9 +26,6 @@ pub(super) trait RowOp: Send + Sync {
 }
 
 /// Applies a row op; `shape` is the output's.
-///
-/// # Errors
-/// Those of candle.
 pub(super) fn apply<R: RowOp + 'static>(x: &Tensor, shape: impl Into<Shape>, op: R) -> Result<Tensor> {
     let width = x.dim(D::Minus1)?;
     if width == 0 {

@@ -21,9 +21,6 @@ pub fn bins(count: usize) -> impl Iterator<Item = f32> {
 }
 
 /// The [`bins`] as a tensor, [count].
-///
-/// # Errors
-/// Those of candle (devices).
 pub fn bins_tensor(count: usize, device: &Device) -> Result<Tensor> {
     Tensor::from_iter(bins(count), device)
 }
@@ -34,9 +31,6 @@ pub fn bins_tensor(count: usize, device: &Device) -> Result<Tensor> {
 /// cancel the positive one only at the end, and leave its rounding errors behind.
 ///
 /// Cost a logit: 25 flops and 4 bytes forward, 30 flops and 8 bytes backward.
-///
-/// # Errors
-/// Those of candle (shapes, devices).
 pub fn two_hot_mean(logits: &Tensor, bins: &Tensor) -> Result<Tensor> {
     if !fusible(&[logits, bins]) {
         return composite::two_hot_mean(logits, bins);
@@ -50,9 +44,6 @@ pub fn two_hot_mean(logits: &Tensor, bins: &Tensor) -> Result<Tensor> {
 /// `bins` [count]: [...]. The targets get no gradient.
 ///
 /// Cost a logit: 25 flops and 4 bytes forward, 25 flops and 8 bytes backward.
-///
-/// # Errors
-/// Those of candle (shapes, devices).
 pub fn two_hot_loss(logits: &Tensor, bins: &Tensor, targets: &Tensor) -> Result<Tensor> {
     let lead = &logits.dims()[..logits.rank().saturating_sub(1)];
     if targets.dims() != lead {

@@ -54,9 +54,6 @@ pub struct Reference {
 
 impl Reference {
     /// Reads a reference file.
-    ///
-    /// # Errors
-    /// See [`ReferenceError`].
     pub fn read(path: &Path) -> Result<Self, ReferenceError> {
         let bytes = read_capped(path, REFERENCE_BYTES_MAX)?;
         let (_, header) = SafeTensors::read_metadata(&bytes).map_err(TensorsError::Format)?;
@@ -146,9 +143,6 @@ impl Reference {
     }
 
     /// The weights, by the parameters' names.
-    ///
-    /// # Errors
-    /// Candle's.
     pub fn weights(&self, device: &Device) -> Result<BTreeMap<String, Tensor>, candle_core::Error> {
         let named = self.tensors.0.iter().filter_map(|(name, values)| {
             name.strip_prefix("weights/").map(|name| Ok((name.to_owned(), to_tensor(values, device)?)))
@@ -158,9 +152,6 @@ impl Reference {
 }
 
 /// A host array as a tensor on `device`.
-///
-/// # Errors
-/// Candle's.
 pub fn to_tensor(values: &Values, device: &Device) -> Result<Tensor, candle_core::Error> {
     let shape = values.shape();
     match values {

@@ -189,9 +189,6 @@ impl Folder {
     }
 
     /// Reads every episode into a replay of this capacity in steps; `seen` hears of each.
-    ///
-    /// # Errors
-    /// See [`LoadError`].
     pub fn load(&self, capacity: usize, mut seen: impl FnMut()) -> Result<Replay, LoadError> {
         let mut replay = Replay::new(capacity);
         for read in self.episodes() {

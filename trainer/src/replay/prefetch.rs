@@ -44,9 +44,6 @@ impl Prefetch {
     }
 
     /// The next batch.
-    ///
-    /// # Errors
-    /// See [`PrefetchError`].
     pub fn next_batch(&mut self) -> Result<HostBatch, PrefetchError> {
         let begin = Instant::now();
         let batches = self.batches.as_ref().ok_or(PrefetchError::Ended)?;

@@ -18,18 +18,12 @@ impl SharedReplay {
     }
 
     /// See [`Replay::add`].
-    ///
-    /// # Errors
-    /// Those of [`Replay::add`].
     pub fn add(&self, task: &str, episode: impl Into<Arc<Episode>>) -> Result<(), ReplayError> {
         // Every change of a replay is whole before anything in it can panic: one that was poisoned is usable.
         self.0.write().unwrap_or_else(PoisonError::into_inner).add(task, episode)
     }
 
     /// See [`Replay::draw`].
-    ///
-    /// # Errors
-    /// Those of [`Replay::draw`].
     pub fn draw(
         &self,
         rows: usize,

@@ -164,9 +164,6 @@ impl Subject {
     }
 
     /// Measures it on a task's trajectories, and draws strips of the first ones; `seen` hears of every trajectory.
-    ///
-    /// # Errors
-    /// See [`ReportError`].
     pub fn measure(
         &self,
         task: &TaskTrajectories,
@@ -201,9 +198,6 @@ impl Subject {
     }
 
     /// Imagines an episode of the task from its beginning and draws the attention; none if there is no such episode, or no interaction.
-    ///
-    /// # Errors
-    /// See [`ReportError`].
     pub fn attend(
         &self,
         recordings: &Recordings,

@@ -74,9 +74,6 @@ pub struct SeedsPart {
 
 impl Report {
     /// Reads all parts of a report.
-    ///
-    /// # Errors
-    /// See [`ReportError`].
     pub fn read(store: &Store, made: Provenance, command: String) -> Result<Self, ReportError> {
         let mut dynamics: Vec<Part<Dynamics>> = store.all()?;
         // RCWM first: it has the first colour everywhere.
@@ -108,9 +105,6 @@ impl Report {
     }
 
     /// Writes `index.html` and `report.json` into the report's folder.
-    ///
-    /// # Errors
-    /// See [`ReportError`].
     pub fn write(&self, folder: &Path) -> Result<(), ReportError> {
         let page = self.html()?;
         let mut text = serde_json::to_vec_pretty(self).map_err(ReportError::Json)?;

@@ -141,9 +141,6 @@ impl Policy {
     }
 
     /// Runs it and films one episode that it solved and one that it did not. `seen` hears how far each simulator is.
-    ///
-    /// # Errors
-    /// See [`ReportError`].
     pub fn measure(
         &self,
         settings: &ClosedLoopSettings,

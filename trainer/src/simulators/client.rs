@@ -33,18 +33,12 @@ pub struct Client {
 
 impl Client {
     /// Connects to the simulator that was started.
-    ///
-    /// # Errors
-    /// See [`LinkError`].
     pub fn of(process: SimulatorProcess) -> Result<Self, ClientError> {
         let link = ControllerLink::open(LinkSettings::new(process.instance()))?;
         Ok(Self { link, process: Some(process), answer: None })
     }
 
     /// Connects to a simulator that runs, or will.
-    ///
-    /// # Errors
-    /// See [`LinkError`].
     pub fn join(instance: &str) -> Result<Self, ClientError> {
         Ok(Self { link: ControllerLink::open(LinkSettings::new(instance))?, process: None, answer: None })
     }

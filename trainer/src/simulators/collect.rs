@@ -248,9 +248,6 @@ fn run_job(
 
 /// Records episodes of a simulator that runs already, until `episodes` were progress or it ends. Every observation is answered by a
 /// random action: a scripted simulator takes it as a receipt, one that waits for a policy executes it.
-///
-/// # Errors
-/// See [`CollectError`].
 pub fn record(
     instance: &str,
     episodes: u64,

@@ -62,9 +62,6 @@ pub struct MatrixSummary {
 }
 
 /// Every weight matrix of the parameters, by name; gains, shifts, biases and initial states are none.
-///
-/// # Errors
-/// Those of candle.
 pub fn summarise(parameters: &Parameters) -> Result<Vec<MatrixSummary>> {
     let mut weights: Vec<(&str, Tensor)> = parameters
         .iter()
@@ -81,9 +78,6 @@ pub fn summarise(parameters: &Parameters) -> Result<Vec<MatrixSummary>> {
 
 impl MatrixSummary {
     /// Of the parameter of this name: a linear layer [out, in], a convolution [out, in, 4, 4], or the decoder's transposed one [in, out, 4, 4].
-    ///
-    /// # Errors
-    /// Those of candle.
     pub fn of(name: &str, weight: &Tensor) -> Result<Self> {
         let is_transposed = weight.rank() == 4 && name.starts_with("decoder.");
         let matrix = if is_transposed { weight.transpose(0, 1)? } else { weight.clone() };

@@ -92,9 +92,6 @@ pub struct Fewshot {
 
 impl Fewshot {
     /// A new run in `folder`, from a pre-trained model.
-    ///
-    /// # Errors
-    /// See [`TrainingError`].
     pub fn create(
         folder: &Path,
         settings: TrainingSettings,
@@ -144,9 +141,6 @@ impl Fewshot {
     }
 
     /// Goes on with the run in `folder` from its newest checkpoint, or from the beginning if there is none yet.
-    ///
-    /// # Errors
-    /// See [`TrainingError`].
     pub fn resume(folder: &Path, settings: TrainingSettings, device: &Device) -> Result<Self, TrainingError> {
         let (run, parameters, state, moments) =
             match Run::go_on(folder, &settings, &[Phase::Fewshot], device)? {

@@ -62,9 +62,6 @@ pub struct Finetuning {
 
 impl Finetuning {
     /// A new run in `folder`, from a model or from scratch.
-    ///
-    /// # Errors
-    /// See [`TrainingError`].
     pub fn create(
         folder: &Path,
         settings: TrainingSettings,
@@ -126,9 +123,6 @@ impl Finetuning {
     }
 
     /// Goes on with the run in `folder` from its newest checkpoint, or from the beginning if there is none yet.
-    ///
-    /// # Errors
-    /// See [`TrainingError`].
     pub fn resume(
         folder: &Path,
         settings: TrainingSettings,
@@ -171,9 +165,6 @@ impl Finetuning {
     }
 
     /// Fills the replay, see [`prefill`].
-    ///
-    /// # Errors
-    /// Those of [`prefill`].
     pub fn prefill(
         &mut self,
         stop: &AtomicBool,

@@ -54,9 +54,6 @@ pub struct Outcome {
 
 impl Pretraining {
     /// A new run in `folder`.
-    ///
-    /// # Errors
-    /// See [`TrainingError`].
     pub fn create(
         folder: &Path,
         settings: TrainingSettings,
@@ -75,9 +72,6 @@ impl Pretraining {
     }
 
     /// Goes on with the run in `folder` from its newest checkpoint.
-    ///
-    /// # Errors
-    /// See [`TrainingError`].
     pub fn resume(
         folder: &Path,
         settings: TrainingSettings,

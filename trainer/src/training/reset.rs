@@ -66,9 +66,6 @@ impl Reset {
 }
 
 /// The parameters a new task starts from: those of `source`, but for what the settings draw anew from the initialiser under `seed`.
-///
-/// # Errors
-/// [`ParameterError::Tensor`].
 pub fn start_from(
     source: &Checkpoint,
     settings: &ResetSettings,

@@ -243,9 +243,6 @@ impl Run {
     }
 
     /// Appends a line of metrics: an object that tells the `update` it was written after. Its numbers go to TensorBoard too.
-    ///
-    /// # Errors
-    /// Those of writing.
     pub fn log(&mut self, line: &impl Serialize) -> Result<(), TrainingError> {
         let line = serde_json::to_value(line)?;
         let update = line["update"].as_u64().unwrap_or_default();
@@ -255,18 +252,12 @@ impl Run {
     }
 
     /// Draws the curves of everything that was logged.
-    ///
-    /// # Errors
-    /// Those of drawing and writing.
     pub fn draw_curves(&self, warm_up_updates: u64) -> Result<(), TrainingError> {
         curves::write(&self.folder.join(METRICS_FILE), &self.folder.join(CURVES_FILE), warm_up_updates)
     }
 
     /// Lets the average follow the weights, where one is kept, after update number `updates`, from 1. `trained` accepts the names of what
     /// may have moved.
-    ///
-    /// # Errors
-    /// Those of candle.
     pub(super) fn ema_update(
         &mut self,
         parameters: &Parameters,
@@ -292,9 +283,6 @@ impl Run {
     }
 
     /// The average to be set by whoever keeps it elsewhere while the run learns; none where none is kept.
-    ///
-    /// # Errors
-    /// Those of candle.
     pub(super) fn average_of(
         &mut self,
         parameters: &Parameters,
@@ -320,9 +308,6 @@ impl Run {
 
     /// Saves a checkpoint as the newest one, and as the best if it is: the weights, or their average where one is kept. The state is written before the weights that it goes with,
     /// and older states are removed after, so that the folder always holds a whole pair.
-    ///
-    /// # Errors
-    /// Those of writing.
     pub fn save(
         &self,
         parameters: &Parameters,

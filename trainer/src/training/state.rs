@@ -96,9 +96,6 @@ fn file_of(folder: &Path, weights_sha256: &str) -> PathBuf {
 impl TrainingState {
     /// Writes the state with the moments of `optimisers`, by name, beside the weights of this checksum, and the weights that are trained
     /// where the checkpoint holds their average.
-    ///
-    /// # Errors
-    /// See [`StateError`].
     pub fn write(
         &self,
         optimisers: &[(&str, &Adam)],
@@ -149,9 +146,6 @@ impl TrainingState {
     }
 
     /// Reads the state that goes with the weights of this checksum, and all moments under their keys.
-    ///
-    /// # Errors
-    /// See [`StateError`].
     pub fn read(folder: &Path, weights_sha256: &str) -> Result<(Self, Tensors), StateError> {
         let file = read_capped(&file_of(folder, weights_sha256), STATE_BYTES_MAX)?;
         let (_, header) = SafeTensors::read_metadata(&file)?;

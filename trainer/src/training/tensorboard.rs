@@ -95,9 +95,6 @@ impl EventFile {
     }
 
     /// Appends scalars of one step.
-    ///
-    /// # Errors
-    /// Those of writing.
     pub(super) fn scalars(&mut self, step: u64, scalars: &[(String, f64)]) -> io::Result<()> {
         let value =
             |(tag, value): &(String, f64)| Value { tag: tag.clone(), simple_value: Some(*value as f32) };

@@ -120,9 +120,6 @@ impl ControllerLink {
 }
 
 /// Tells the simulator of an instance that no further action will come, on behalf of a controller whose own thread is stuck.
-///
-/// # Errors
-/// See [`LinkError`].
 pub fn say_closed_for(settings: &LinkSettings) -> Result<(), LinkError> {
     let node = make_node(settings)?;
     Direction::<Action>::open(&node, &settings.instance, "action")?.waker()?.notify(EVENT_CLOSED)

@@ -19,9 +19,6 @@ pub struct ObserverLink {
 
 impl ObserverLink {
     /// Opens or creates the observation service of an instance.
-    ///
-    /// # Errors
-    /// See [`LinkError`].
     pub fn open(settings: LinkSettings) -> Result<Self, LinkError> {
         join(&settings.clone(), 0, |node| {
             let observations =
@@ -48,9 +45,6 @@ pub struct ActionObserverLink {
 
 impl ActionObserverLink {
     /// Opens or creates the action service of an instance.
-    ///
-    /// # Errors
-    /// See [`LinkError`].
     pub fn open(settings: &LinkSettings) -> Result<Self, LinkError> {
         join(settings, 0, |node| {
             let actions = Direction::<Action>::open(&node, &settings.instance, "action")?.receiver()?;

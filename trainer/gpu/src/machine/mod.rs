@@ -160,9 +160,6 @@ impl Machine {
     }
 
     /// Copies numbers to an address that [`Machine::allocate`] gave, after everything that was run before.
-    ///
-    /// # Errors
-    /// [`GpuError::Failed`].
     pub fn upload<T: bytemuck::Pod>(&mut self, address: u64, values: &[T]) -> Result<(), GpuError> {
         let bytes = bytemuck::cast_slice(values);
         match self {
@@ -174,9 +171,6 @@ impl Machine {
     }
 
     /// Copies numbers from an address, after everything that was run before.
-    ///
-    /// # Errors
-    /// [`GpuError::Failed`].
     pub fn download<T: bytemuck::Pod>(&mut self, address: u64, values: &mut [T]) -> Result<(), GpuError> {
         let bytes = bytemuck::cast_slice_mut(values);
         match self {
@@ -188,9 +182,6 @@ impl Machine {
     }
 
     /// Makes a program ready; on a GPU it is captured, so that its first run costs what every run does.
-    ///
-    /// # Errors
-    /// [`GpuError::Failed`].
     pub fn prepare(&mut self, finished: Finished) -> Result<Ready, GpuError> {
         Ok(Ready {
             #[cfg(feature = "cuda")]
@@ -203,9 +194,6 @@ impl Machine {
     }
 
     /// Runs a program; on a GPU it may be under way when this returns.
-    ///
-    /// # Errors
-    /// [`GpuError::Failed`].
     pub fn run(&mut self, program: &Ready) -> Result<(), GpuError> {
         match self {
             Self::Host(host) => host.run(&program.finished),
@@ -216,9 +204,6 @@ impl Machine {
     }
 
     /// Runs a program command by command and says how long each part took.
-    ///
-    /// # Errors
-    /// [`GpuError::Failed`].
     pub fn time_parts(&mut self, program: &Ready) -> Result<Vec<PartTime>, GpuError> {
         match self {
             Self::Host(host) => Ok(host.time_parts(&program.finished)),
@@ -230,9 +215,6 @@ impl Machine {
 
 impl Machine {
     /// How long each kind of command of a program takes by itself, the dearest first; nothing on the host.
-    ///
-    /// # Errors
-    /// [`GpuError::Failed`].
     pub fn time_commands(&mut self, program: &Ready) -> Result<Vec<CommandTime>, GpuError> {
         match self {
             Self::Host(_) => Ok(Vec::new()),

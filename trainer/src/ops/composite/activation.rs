@@ -1,26 +1,17 @@
 use candle_core::{D, Result, Tensor};
 
 /// `1 / (1 + exp(-x))`, through tanh: no overflow and no NaN gradient for any x.
-///
-/// # Errors
-/// Those of candle (shapes, devices).
 pub fn sigmoid(x: &Tensor) -> Result<Tensor> {
     (x * 0.5)?.tanh()?.affine(0.5, 0.5)
 }
 
 /// Softmax over the last dimension.
-///
-/// # Errors
-/// Those of candle (shapes, devices).
 pub fn softmax(x: &Tensor) -> Result<Tensor> {
     let exp = shifted(x)?.exp()?;
     exp.broadcast_div(&exp.sum_keepdim(D::Minus1)?)
 }
 
 /// Logarithm of the softmax over the last dimension.
-///
-/// # Errors
-/// Those of candle (shapes, devices).
 pub fn log_softmax(x: &Tensor) -> Result<Tensor> {
     let shifted = shifted(x)?;
     shifted.broadcast_sub(&shifted.exp()?.sum_keepdim(D::Minus1)?.log()?)

@@ -4,26 +4,17 @@ use super::{log_softmax, softmax};
 use crate::ops::KlBalance;
 
 /// Class probabilities with a share of the uniform distribution mixed in: `(1 - u) softmax(logits) + u / m`.
-///
-/// # Errors
-/// Those of candle (shapes, devices).
 pub fn probs(logits: &Tensor, unimix: f64) -> Result<Tensor> {
     let classes = logits.dim(D::Minus1)? as f64;
     softmax(logits)?.affine(1.0 - unimix, unimix / classes)
 }
 
 /// Logarithm of [`probs`].
-///
-/// # Errors
-/// Those of candle (shapes, devices).
 pub fn log_probs(logits: &Tensor, unimix: f64) -> Result<Tensor> {
     if unimix == 0.0 { log_softmax(logits) } else { probs(logits, unimix)?.log() }
 }
 
 /// One-hot of the largest entry of the last dimension (the first of equals), without gradient.
-///
-/// # Errors
-/// Those of candle (shapes, devices).
 pub fn one_hot_of_best(scores: &Tensor) -> Result<Tensor> {
     let scores = scores.detach();
     let best = scores.argmax_keepdim(D::Minus1)?; // [..., 1] u32
@@ -35,9 +26,6 @@ pub fn one_hot_of_best(scores: &Tensor) -> Result<Tensor> {
 ///
 /// `gumbel` is added to the log-probabilities before the argmax, which draws from the distribution; without it the
 /// sample is the most probable class.
-///
-/// # Errors
-/// Those of candle (shapes, devices).
 pub fn straight_through_sample(logits: &Tensor, unimix: f64, gumbel: Option<&Tensor>) -> Result<Tensor> {
     let p = probs(logits, unimix)?;
     let sample = match gumbel {
@@ -48,26 +36,17 @@ pub fn straight_through_sample(logits: &Tensor, unimix: f64, gumbel: Option<&Ten
 }
 
 /// The most probable class, with a gradient through the log-probabilities: `mode + log p - sg(log p)`.
-///
-/// # Errors
-/// Those of candle (shapes, devices).
 pub fn straight_through_mode(logits: &Tensor, unimix: f64) -> Result<Tensor> {
     let log_p = log_probs(logits, unimix)?;
     one_hot_of_best(&log_p)? + (&log_p - log_p.detach())?
 }
 
 /// See [`crate::ops::entropy`].
-///
-/// # Errors
-/// Those of candle (shapes, devices).
 pub fn entropy(logits: &Tensor, unimix: f64) -> Result<Tensor> {
     (probs(logits, unimix)? * log_probs(logits, unimix)?)?.sum(D::Minus1)?.neg()
 }
 
 /// See [`crate::ops::balanced_kl`].
-///
-/// # Errors
-/// Those of candle (shapes, devices).
 pub fn balanced_kl(q: &Tensor, p: &Tensor, unimix: f64, balance: KlBalance) -> Result<(Tensor, Tensor)> {
     let kl = |q: &Tensor, p: &Tensor| {
         let ratio = (log_probs(q, unimix)? - log_probs(p, unimix)?)?;

@@ -5,9 +5,6 @@ use super::sigmoid;
 /// The gates of the recurrent cell: `gates` [B, 3d] holds `reset, cand, update` after their LayerNorm; gives
 /// `h' = update * cand + (1 - update) * h` [B, d], where `cand = tanh(sigmoid(reset) * cand)` and
 /// `update = sigmoid(update - 1)`: a new cell keeps what it knows.
-///
-/// # Errors
-/// Those of candle (shapes, devices).
 pub fn recurrent_update(gates: &Tensor, h: &Tensor) -> Result<Tensor> {
     let d = h.dim(D::Minus1)?;
     let gate = |index: usize| gates.narrow(D::Minus1, index * d, d);

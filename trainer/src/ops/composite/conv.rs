@@ -32,9 +32,6 @@ pub fn conv_down(x: &Tensor, weight: &Tensor) -> Result<Tensor> {
 
 /// Doubles the sides of a feature map (transposed convolution): `x` [B, H, W, C], `weight` [C, out, 4, 4], gives
 /// [B, 2H, 2W, out].
-///
-/// # Errors
-/// Those of candle (shapes, devices).
 pub fn conv_up(x: &Tensor, weight: &Tensor) -> Result<Tensor> {
     let (batch, height, width, channels) = x.dims4()?;
     let out = weight.dim(1)?;

@@ -1,9 +1,6 @@
 use candle_core::{D, Result, Tensor};
 
 /// `x W^T + b` over the last dimension: `x` [..., in], `weight` [out, in], `bias` [out], gives [..., out].
-///
-/// # Errors
-/// Those of candle (shapes, devices).
 pub fn linear(x: &Tensor, weight: &Tensor, bias: Option<&Tensor>) -> Result<Tensor> {
     let (out, width) = weight.dims2()?;
     let mut shape = x.dims().to_vec();

@@ -1,9 +1,6 @@
 use candle_core::{D, Result, Tensor};
 
 /// LayerNorm over the last dimension, biased variance: `(x - mean) / sqrt(var + eps) * weight + bias`.
-///
-/// # Errors
-/// Those of candle (shapes, devices).
 pub fn layer_norm(x: &Tensor, weight: &Tensor, bias: &Tensor, eps: f64) -> Result<Tensor> {
     let centred = x.broadcast_sub(&x.mean_keepdim(D::Minus1)?)?;
     let variance = centred.sqr()?.mean_keepdim(D::Minus1)?;
@@ -12,9 +9,6 @@ pub fn layer_norm(x: &Tensor, weight: &Tensor, bias: &Tensor, eps: f64) -> Resul
 }
 
 /// LayerNorm, then `SiLU`: what follows every hidden layer.
-///
-/// # Errors
-/// Those of candle (shapes, devices).
 pub fn layer_norm_silu(x: &Tensor, weight: &Tensor, bias: &Tensor, eps: f64) -> Result<Tensor> {
     layer_norm(x, weight, bias, eps)?.silu()
 }

@@ -3,9 +3,6 @@ use candle_core::{D, DType, Result, Tensor};
 use super::sigmoid;
 
 /// See [`crate::ops::image_to_float`].
-///
-/// # Errors
-/// Those of candle.
 pub fn image_to_float(image: &Tensor) -> Result<Tensor> {
     // A division, not a product with the inverse: the last bit then agrees with other implementations.
     let full = Tensor::new(255f32, image.device())?;
@@ -13,17 +10,11 @@ pub fn image_to_float(image: &Tensor) -> Result<Tensor> {
 }
 
 /// The reconstructed image [..., 3] and its mask [..., 1] of raw decoder outputs [..., 4].
-///
-/// # Errors
-/// Those of candle.
 pub fn reconstruction(raw: &Tensor) -> Result<(Tensor, Tensor)> {
     Ok((raw.narrow(D::Minus1, 0, 3)?, sigmoid(&raw.narrow(D::Minus1, 3, 1)?)?))
 }
 
 /// See [`crate::ops::picture_loss`].
-///
-/// # Errors
-/// Those of candle (shapes, devices).
 pub fn picture_loss(
     raws: &[&Tensor],
     image: &Tensor,

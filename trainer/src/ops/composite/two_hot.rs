@@ -3,25 +3,16 @@ use candle_core::{D, DType, Result, Tensor};
 use super::{log_softmax, softmax};
 
 /// `sign(x) ln(1 + |x|)`: squeezes values of any scale.
-///
-/// # Errors
-/// Those of candle (shapes, devices).
 pub fn symlog(x: &Tensor) -> Result<Tensor> {
     x.sign()? * (x.abs()? + 1.0)?.log()?
 }
 
 /// The inverse of [`symlog`]: `sign(x) (exp(|x|) - 1)`.
-///
-/// # Errors
-/// Those of candle (shapes, devices).
 pub fn symexp(x: &Tensor) -> Result<Tensor> {
     x.sign()? * (x.abs()?.exp()? - 1.0)?
 }
 
 /// Mean of the distribution given by `logits` [..., count] over `bins` [count], as a value: [..., 1].
-///
-/// # Errors
-/// Those of candle (shapes, devices).
 pub fn two_hot_mean(logits: &Tensor, bins: &Tensor) -> Result<Tensor> {
     let half = bins.dim(0)? / 2;
     let p = softmax(logits)?;
@@ -33,9 +24,6 @@ pub fn two_hot_mean(logits: &Tensor, bins: &Tensor) -> Result<Tensor> {
 }
 
 /// See [`crate::ops::two_hot_loss`].
-///
-/// # Errors
-/// Those of candle (shapes, devices).
 pub fn two_hot_loss(logits: &Tensor, bins: &Tensor, targets: &Tensor) -> Result<Tensor> {
     let targets = targets.detach().unsqueeze(D::Minus1)?; // [..., 1]
     let count = bins.dim(0)?;
