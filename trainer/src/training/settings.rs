@@ -130,7 +130,7 @@ impl Default for PretrainSettings {
 }
 
 /// The paper's, but for `small`, which is to learn in an hour what the paper's preset takes days for: a higher learning rate, and rewards
-/// that do not drown the few other numbers there are to learn from (tried in `LAB.md`).
+/// that do not drown the few other numbers there are to learn from (tried in `docs/history/lab.md`).
 fn world_settings(preset: Preset) -> WorldSettings {
     let mut world = WorldSettings::default();
     if preset == Preset::Small {
@@ -184,7 +184,7 @@ impl TrainingSettings {
     }
 
     /// A run of another phase, with what the preset has for it: few-shot learning of `small` goes through whole demonstrations, decodes few
-    /// of their steps, and lets the reward say what matters in the scene (tried in `LAB.md`).
+    /// of their steps, and lets the reward say what matters in the scene (tried in `docs/history/lab.md`).
     #[must_use]
     pub fn of_phase(phase: Phase, preset: Preset, kind: ModelKind) -> Self {
         let mut settings = Self { phase, ..Self::preset(preset, kind, PathBuf::new()) };
