@@ -4,7 +4,7 @@ use std::ops::Deref;
 
 use indicatif::ProgressBar;
 
-use crate::terminal::Heartbeat;
+use crate::terminal::{Heartbeat, shown};
 
 /// A bar; where no terminal shows it, a line every so often says how far the work is.
 #[derive(Debug)]
@@ -25,6 +25,11 @@ impl Bar {
         Self { bar, _lines: lines }
     }
 
+    /// What is done at the moment; names in it come from other people's files.
+    pub fn set_message(&self, text: impl AsRef<str>) {
+        self.bar.set_message(shown(text.as_ref()).into_owned());
+    }
+
     /// A line above the bar, or on its own.
     pub fn say(&self, line: &str) {
         say(&self.bar, line);
@@ -43,6 +48,6 @@ pub fn say(bar: &ProgressBar, line: &str) {
     if bar.is_hidden() {
         crate::errln!("{line}");
     } else {
-        bar.println(crate::terminal::shown(line));
+        bar.println(shown(line));
     }
 }

@@ -1,5 +1,5 @@
 //! No file and no folder imports what imports it (ARCHITECTURE.md, invariants). A module and those inside it count as one house: a
-//! `mod.rs` may use its parts, and they may use what it holds.
+//! `mod.rs` may use its parts, and they may use what it holds, names that it re-exports included.
 
 #![allow(clippy::unwrap_used, reason = "a test that fails panics")]
 
@@ -142,6 +142,18 @@ fn no_file_and_no_folder_imports_what_imports_it() {
         assert_eq!(circles(graph), Graph::new(), "{folder}: files import each other");
     }
     assert!(count > 300, "only {count} imports were found");
+}
+
+#[test]
+fn what_a_file_names_is_found_but_for_its_tests() {
+    let text = "use super::b::{self, c::D}; fn f() { crate::e::g(); }
+                #[cfg(test)] mod tests { use crate::only::here; }";
+    let mut named = Named::default();
+    named.visit_file(&syn::parse_file(text).unwrap());
+    let module = |path: &str| path.split("::").map(str::to_owned).collect::<Module>();
+    let all = ["a", "b", "b::c", "e", "only"].map(|path| (module(path), PathBuf::new())).into();
+    let found: BTreeSet<_> = named.0.iter().filter_map(|path| resolve(path, &module("a"), &all)).collect();
+    assert_eq!(found, [module("b"), module("b::c"), module("e")].into());
 }
 
 #[test]

@@ -9,6 +9,7 @@ import ctypes
 import errno
 import math
 import os
+import stat
 import time
 
 import iceoryx2 as iox2
@@ -74,19 +75,36 @@ class SharedMemoryFull(OSError):
     """No room in /dev/shm: said before anything is written, as the first write to a page without room ends a process by SIGBUS."""
 
 
-def _check_room(needed: int) -> None:
+def _full(needed: int) -> str:
     shared = os.statvfs("/dev/shm")
     free = shared.f_bavail * shared.f_frsize
+    return (
+        f"shared memory is full: /dev/shm has {free >> 10} KiB free and {-(-needed >> 10)} are needed; remove files there, "
+        "or give the container more (--shm-size)"
+    )
+
+
+def _check_room(needed: int) -> None:
+    try:
+        shared = os.statvfs("/dev/shm")
+    except OSError:  # where it cannot be told there may be room
+        return
+    free = shared.f_bavail * shared.f_frsize
     if free < needed:
-        raise SharedMemoryFull(
-            f"shared memory is full: /dev/shm has {free >> 10} KiB free and {needed >> 10} are needed; remove files there, "
-            "or give the container more (--shm-size)"
-        )
+        raise SharedMemoryFull(_full(needed))
 
 
 def _own_files(prefix: str) -> set[str]:
-    entries = os.scandir("/dev/shm")
-    return {entry.path for entry in entries if entry.name.startswith(prefix) and entry.stat().st_uid == os.geteuid()}
+    found = set()
+    with os.scandir("/dev/shm") as entries:
+        for entry in entries:
+            try:
+                status = entry.stat(follow_symlinks=False)
+            except OSError:  # a peer has just removed its own
+                continue
+            if entry.name.startswith(prefix) and stat.S_ISREG(status.st_mode) and status.st_uid == os.geteuid():
+                found.add(entry.path)
+    return found
 
 
 def _reserve(paths: set[str]) -> None:
@@ -97,10 +115,12 @@ def _reserve(paths: set[str]) -> None:
         except OSError:  # a peer has removed its own
             continue
         try:
-            os.posix_fallocate(descriptor, 0, max(1, os.fstat(descriptor).st_size))
+            size = os.fstat(descriptor).st_size
+            if size:
+                os.posix_fallocate(descriptor, 0, size)
         except OSError as error:
             if error.errno == errno.ENOSPC:
-                _check_room(1 << 62)
+                raise SharedMemoryFull(_full(size)) from None
         finally:
             os.close(descriptor)
 

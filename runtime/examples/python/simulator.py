@@ -76,7 +76,9 @@ def main() -> None:
                 counts["observations"] += 1
                 answer = ask(link, observation, options.timeout_s)
                 if answer is None:
-                    raise SystemExit(f"no answer on {options.instance!r} within {options.timeout_s} s: is a controller running?")
+                    raise SystemExit(
+                        f"no answer on {options.instance!r} within {options.timeout_s} s ({link.refused} refused): is a controller running?"
+                    )
                 counts["answers"] += 1
                 action = list(answer.action)
                 reward = table.move(action)

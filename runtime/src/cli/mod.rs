@@ -227,12 +227,14 @@ fn stop_flag_after(last: impl Fn() + Clone + Send + 'static) -> anyhow::Result<A
         if first.get_or_insert_with(Instant::now).elapsed() > ONE_SIGNAL {
             let (done, is_done) = std::sync::mpsc::channel();
             let last = last.clone();
-            std::thread::spawn(move || {
+            let work = move || {
                 last();
                 done.send(())
-            });
-            // What takes longer, or panics, is not waited for.
-            let _ = is_done.recv_timeout(LAST_DEED);
+            };
+            // What takes longer, panics or finds no thread is not waited for.
+            if std::thread::Builder::new().spawn(work).is_ok() {
+                let _ = is_done.recv_timeout(LAST_DEED);
+            }
             std::process::exit(i32::from(Exit::AtOnce as u8));
         }
     })

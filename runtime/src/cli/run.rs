@@ -1,7 +1,8 @@
 //! `rcwm-runtime run`.
 
 use std::path::PathBuf;
-use std::sync::atomic::AtomicBool;
+use std::sync::Arc;
+use std::sync::atomic::{AtomicBool, Ordering};
 use std::time::Duration;
 
 use anyhow::Context;
@@ -77,9 +78,16 @@ pub(super) struct RunArguments {
 pub(super) fn run(arguments: &RunArguments) -> anyhow::Result<()> {
     arguments.observers.prepare(arguments.json.as_deref())?;
     let link = LinkSettings::new(&arguments.instance);
-    let stop = super::stop_flag_after(move || {
-        // The loop may be stuck. Where the robot cannot be told, nobody is left to hear why.
-        let _ = say_closed_for(&link);
+    // Before and after, the robot may be another controller's.
+    let is_ours = Arc::new(AtomicBool::new(false));
+    let stop = super::stop_flag_after({
+        let is_ours = Arc::clone(&is_ours);
+        move || {
+            if is_ours.load(Ordering::Relaxed) {
+                // The loop may be stuck. Where the robot cannot be told, nobody is left to hear why.
+                let _ = say_closed_for(&link);
+            }
+        }
     })?;
     let bundle = super::open_bundle(&arguments.bundle)?;
     let engine = EngineSettings::chosen(arguments.engine, arguments.threads, arguments.half_weights)?;
@@ -96,6 +104,7 @@ pub(super) fn run(arguments: &RunArguments) -> anyhow::Result<()> {
     };
     let mut observers = Observers::start(&arguments.observers, &bundle, &policy, log)?;
     let mut controller = Controller::open(policy, settings)?;
+    is_ours.store(true, Ordering::Relaxed);
     match arguments.swapper(&bundle, engine, sampling) {
         Ok(swapper) => controller.take_swaps(swapper),
         // A run without swaps is better than none.
@@ -120,6 +129,7 @@ pub(super) fn run(arguments: &RunArguments) -> anyhow::Result<()> {
     report.realtime = granted;
     report.remarks = remarks;
     let telemetry = controller.telemetry().clone();
+    is_ours.store(false, Ordering::Relaxed);
     drop(controller);
     report.frames_dropped = observers.frames_dropped();
     let (left, unwritten) = observers.finish();

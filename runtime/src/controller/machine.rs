@@ -202,7 +202,7 @@ mod tests {
     }
 
     #[test]
-    fn a_policy_s_action_is_sent_on_its_decision_only_and_leads_to_following() {
+    fn a_policy_s_action_is_sent_on_its_decision_only_and_leads_to_tracking() {
         for state in all_states() {
             for event in [Event::Overdue, Event::Left].into_iter().chain(INVALID.map(Event::Invalid)) {
                 let (next, response) = step(state, event, LIMITS);

@@ -231,6 +231,8 @@ impl Replayer {
     fn go_back(&mut self, outcome: &LoggedOutcome) -> Option<()> {
         let LoggedOutcome::StateSet(wanted) = outcome else { return None };
         let (_, state) = self.states.iter().rev().find(|(checksum, _)| checksum == wanted)?;
+        // The last observation may have been answered once more, which is no tick: then the rate limit counts from that answer.
+        self.last_sent_known &= self.report.log.rate_max.is_none();
         self.policy.set_state(state).ok()
     }
 

@@ -17,7 +17,7 @@ const ZOOM: u32 = 6;
 /// Width of the black gap between picture and mask, in pixels of the observation.
 const GAP: u32 = 2;
 
-/// Makes the folder, and makes sure that no picture of an earlier run of this task would be written over.
+/// Makes the folder, and makes sure that it holds no picture of an earlier run of this task, whose episodes may have the same numbers.
 ///
 /// # Errors
 /// [`SimulatorError::File`].
