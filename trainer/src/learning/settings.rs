@@ -59,6 +59,8 @@ mod tests {
     fn a_part_of_the_settings_is_enough_and_an_unknown_one_is_refused() {
         let found: WorldSettings = toml::from_str("reward_scale = 1.0").unwrap();
         assert_eq!(found, WorldSettings { reward_scale: 1.0, ..WorldSettings::default() });
+        let former: WorldSettings = toml::from_str("paint_every = 4").unwrap();
+        assert_eq!(former, WorldSettings { decode_every: 4, ..WorldSettings::default() });
         assert!(toml::from_str::<WorldSettings>("reward_scael = 1.0").is_err());
         assert!(toml::from_str::<WorldSettings>("[adam]\nlr = 1.0").is_err());
     }
