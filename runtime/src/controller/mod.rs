@@ -13,6 +13,7 @@
 //! image corrects it.
 
 mod ended;
+mod episode_result;
 mod episodes;
 mod guard;
 mod imagined;
@@ -29,9 +30,10 @@ mod times;
 mod transport;
 
 pub use ended::{ControllerError, Ended};
+pub use episode_result::EpisodeResult;
 pub use episodes::{EPISODES_KEPT, Episodes};
 pub use machine::{Cause, Event, Response, State, TickLimits, step};
-pub use report::{Counters, EpisodeResult, Pace, RunReport};
+pub use report::{Counters, Pace, RunReport};
 pub use safety_filter::{Fallback, Passed, SafetyFilter};
 pub use sequence::{Arrival, SequenceTracker};
 pub use settings::ControllerSettings;

@@ -291,7 +291,7 @@ impl Policy {
         let action = self.noise.action(&mean, &std);
         // A sample of two finite numbers can be too large for one: no limit makes that an action.
         parts::finite(PartName::Actor, "mean", &action)?;
-        self.state.take_posterior(&self.buffers);
+        self.buffers.give_posterior(&mut self.state);
         let action = self.limits.clamp(action);
         Ok(Decision { action, mean, std, stage_ns, surprise, recomputed, helper_late })
     }

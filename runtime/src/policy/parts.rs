@@ -5,7 +5,7 @@ use rcwm_models::ACTION_LEN;
 use rcwm_models::bundle::{Bundle, PartName};
 use rcwm_models::settings::ModelSettings;
 
-use super::{BranchState, PolicyError, Surprise};
+use super::{BranchState, PolicyError, State, Surprise};
 use crate::engine::{self, EngineError, EngineSettings, Input, Output, Part};
 use rcwm_kernels::tick::latents;
 
@@ -45,6 +45,15 @@ pub struct Buffers {
 }
 
 impl Buffers {
+    /// Hands posterior z and h of the tick that is in the buffers to the state. Copies, allocates nothing.
+    pub(super) fn give_posterior(&self, state: &mut State) {
+        for (state, branch) in [(&mut state.robot, &self.robot), (&mut state.environment, &self.environment)]
+        {
+            state.z.copy_from_slice(&branch.posterior_z);
+            state.h.copy_from_slice(&branch.h_next);
+        }
+    }
+
     pub(super) fn new(model: &ModelSettings) -> Self {
         let (n, d, width) = (model.categoricals, model.deter, model.stoch_width());
         let side = rcwm_models::IMAGE_SIDE / 4;

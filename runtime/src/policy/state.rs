@@ -2,8 +2,6 @@
 
 use rcwm_models::bundle::InitialState;
 
-use super::Buffers;
-
 /// State of one branch.
 #[derive(Debug, PartialEq, Default)]
 pub struct BranchState {
@@ -65,16 +63,6 @@ impl State {
                 branch.z.iter().fold(sum, |sum, class| crc32c::crc32c_append(sum, &class.to_le_bytes()));
             branch.h.iter().fold(sum, |sum, value| crc32c::crc32c_append(sum, &value.to_le_bytes()))
         })
-    }
-
-    /// Takes over posterior z and h of the tick that is in the buffers. Copies, allocates nothing.
-    pub(super) fn take_posterior(&mut self, buffers: &Buffers) {
-        for (state, branch) in
-            [(&mut self.robot, &buffers.robot), (&mut self.environment, &buffers.environment)]
-        {
-            state.z.copy_from_slice(&branch.posterior_z);
-            state.h.copy_from_slice(&branch.h_next);
-        }
     }
 
     /// Whether every z is one of this many classes, and every h finite.

@@ -8,7 +8,7 @@ use super::node::{Backward, floats, fusible, mismatch, record};
 use super::rows::{self, RowOp};
 use rcwm_kernels::batch::categorical::{self, Divergence, Output};
 
-pub use super::composite::one_hot_of_best;
+pub use super::composite::{KlBalance, one_hot_of_best};
 
 /// Class probabilities with a share of the uniform distribution mixed in: `(1 - u) softmax(logits) + u / m`.
 ///
@@ -103,17 +103,6 @@ impl RowOp for Entropy {
     fn backward(&self, x: &[f32], width: usize, _: Range<usize>, d_out: &[f32], dx: &mut [f32]) {
         categorical::entropy_backward(x, width, self.unimix, d_out, dx);
     }
-}
-
-/// How a divergence becomes a loss (eq. 3): below `free` nats it costs a constant.
-#[derive(Debug, Clone, Copy, PartialEq)]
-pub struct KlBalance {
-    /// Nats that are free.
-    pub free: f64,
-    /// Weight of the half that trains the prior.
-    pub prior_scale: f64,
-    /// Weight of the half that trains the posterior.
-    pub posterior_scale: f64,
 }
 
 /// `prior_scale max(free, KL[sg(q)||p]) + posterior_scale max(free, KL[q||sg(p)])` of each row, and the divergence itself without

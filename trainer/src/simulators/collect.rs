@@ -9,54 +9,15 @@ use rand_chacha::ChaCha8Rng;
 use rcwm_models::ACTION_LEN;
 use rcwm_models::episode::{Episode, EpisodeError};
 use rcwm_models::files::{FileError, free_name};
-use rcwm_models::lock::{Lock, LockError};
+use rcwm_models::lock::Lock;
 use rcwm_models::tasks::task_name;
 use serde::Serialize;
 
 use super::recorder::{Recorded, Recorder};
-use super::{Client, ClientError, Job, LEARNING, Launch, Plan, SimulatorProcess};
+use super::{Client, CollectError, Job, LEARNING, Launch, Plan, SimulatorProcess};
 
 /// A simulator whose trainer is gone ends by itself after so long.
 const SILENCE_MAX: Duration = Duration::from_secs(60);
-
-/// Why collecting failed.
-#[derive(Debug, thiserror::Error)]
-pub enum CollectError {
-    /// A simulator.
-    #[error(transparent)]
-    Client(#[from] ClientError),
-    /// An episode could not be put together or written.
-    #[error(transparent)]
-    Episode(#[from] EpisodeError),
-    /// A second look at an episode was not of the same episode.
-    #[error(
-        "episode {path}: with the look {look} the same script did something else; it was collected with other steps, by another version, or changed. \
-         Collect into an empty folder"
-    )]
-    OtherEpisode {
-        /// The file.
-        path: PathBuf,
-        /// The disturbance.
-        look: String,
-    },
-    /// Somebody else collects into the folder.
-    #[error(transparent)]
-    Lock(#[from] LockError),
-    /// A folder could not be made.
-    #[error("{path}: {source}")]
-    Folder {
-        /// The folder.
-        path: PathBuf,
-        /// What the operating system said.
-        source: std::io::Error,
-    },
-}
-
-impl From<super::ProcessError> for CollectError {
-    fn from(error: super::ProcessError) -> Self {
-        Self::Client(error.into())
-    }
-}
 
 /// How to collect.
 #[derive(Debug, Clone)]

@@ -12,13 +12,13 @@ pub const LAYOUTS: [&str; 3] = [LEARNING, "choosing", REPORTING];
 
 mod client;
 mod collect;
+mod collect_error;
 mod plan;
 mod process;
 mod recorder;
 
 pub use client::{Client, ClientError};
-pub use collect::{
-    CollectError, CollectSettings, Collected, Progress, Sums, collect, collect_disturbed, record,
-};
+pub use collect::{CollectSettings, Collected, Progress, Sums, collect, collect_disturbed, record};
+pub use collect_error::CollectError;
 pub use plan::{Amounts, Job, Plan, Script};
 pub use process::{Launch, ProcessError, Program, RunningProgram, SimulatorProcess};

@@ -4,47 +4,9 @@ use std::sync::atomic::AtomicBool;
 
 use serde::{Deserialize, Serialize};
 
-use super::{TrainingError, TrainingSettings};
+use super::{EvaluationSettings, TrainingError, TrainingSettings};
 use crate::evaluation::{ClosedLoopError, ClosedLoopSettings, TRAINER_ENGINE, closed_loop_in_trainer};
 use crate::model::agent::Agent;
-use crate::simulators::LAYOUTS;
-
-/// When and on what a run that acts is judged.
-#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
-#[serde(deny_unknown_fields, default)]
-pub struct EvaluationSettings {
-    /// Steps of the policy between two evaluations, the first before any; 0 evaluates never.
-    pub every_steps: u64,
-    /// Episodes of each.
-    pub episodes: u64,
-    /// The set of layouts: one of [`LAYOUTS`]. `choosing` unless the curve is to be reported and nothing is chosen by it.
-    pub layouts: String,
-}
-
-impl Default for EvaluationSettings {
-    fn default() -> Self {
-        Self { every_steps: 0, episodes: 20, layouts: "choosing".to_owned() }
-    }
-}
-
-impl EvaluationSettings {
-    /// What is wrong, if anything.
-    pub(super) fn invalid(&self) -> Option<String> {
-        if self.episodes == 0 {
-            return Some("finetune.evaluation.episodes = 0, expected at least 1".to_owned());
-        }
-        if !LAYOUTS.contains(&self.layouts.as_str()) {
-            let (found, expected) = (&self.layouts, LAYOUTS.join(", "));
-            return Some(format!("finetune.evaluation.layouts = {found:?}, expected one of {expected}"));
-        }
-        None
-    }
-
-    /// How many evaluations are due after so many steps.
-    pub(super) fn due(&self, policy_steps: u64) -> u64 {
-        policy_steps.checked_div(self.every_steps).map_or(0, |whole| whole + 1)
-    }
-}
 
 /// An evaluation as a line of metrics tells it.
 #[derive(Debug, Clone, PartialEq, Serialize)]

@@ -2,9 +2,8 @@ use std::sync::Arc;
 
 use candle_core::Device;
 use rcwm_models::episode::Episode;
-use serde::{Deserialize, Serialize};
 
-use super::{Run, TrainingError};
+use super::{FilmSettings, Run, TrainingError};
 use crate::evaluation::{Film, open_loop};
 use crate::learning::HostBatch;
 use crate::model::agent::Agent;
@@ -13,24 +12,6 @@ use crate::replay::{Replay, append_steps};
 
 /// A task and an episode of it to make films of.
 pub(super) type Scene = (String, Arc<Episode>);
-
-/// Films of the open loop, one a task, with every checkpoint.
-#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
-#[serde(deny_unknown_fields, default)]
-pub struct FilmSettings {
-    /// Steps that are seen before the model imagines.
-    pub context: usize,
-    /// Steps in all; 0 makes no films.
-    pub length: usize,
-    /// Steps from one picture of the strip to the next; the film shows every step.
-    pub every: usize,
-}
-
-impl Default for FilmSettings {
-    fn default() -> Self {
-        Self { context: 10, length: 64, every: 4 }
-    }
-}
 
 impl FilmSettings {
     /// A task and its first episode that is long enough to imagine some of, for every task.

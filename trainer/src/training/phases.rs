@@ -3,10 +3,46 @@ use rcwm_models::episode::STEPS_MAX;
 use rcwm_models::settings::{Preset, SettingsError};
 use serde::{Deserialize, Serialize};
 
-use super::EvaluationSettings;
 use crate::cloning::{CloningSettings, Ramp};
 use crate::replay::Starts;
-use crate::simulators::DISTURBANCES;
+use crate::simulators::{DISTURBANCES, LAYOUTS};
+
+/// When and on what a run that acts is judged.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields, default)]
+pub struct EvaluationSettings {
+    /// Steps of the policy between two evaluations, the first before any; 0 evaluates never.
+    pub every_steps: u64,
+    /// Episodes of each.
+    pub episodes: u64,
+    /// The set of layouts: one of [`LAYOUTS`]. `choosing` unless the curve is to be reported and nothing is chosen by it.
+    pub layouts: String,
+}
+
+impl Default for EvaluationSettings {
+    fn default() -> Self {
+        Self { every_steps: 0, episodes: 20, layouts: "choosing".to_owned() }
+    }
+}
+
+impl EvaluationSettings {
+    /// What is wrong, if anything.
+    pub(super) fn invalid(&self) -> Option<String> {
+        if self.episodes == 0 {
+            return Some("finetune.evaluation.episodes = 0, expected at least 1".to_owned());
+        }
+        if !LAYOUTS.contains(&self.layouts.as_str()) {
+            let (found, expected) = (&self.layouts, LAYOUTS.join(", "));
+            return Some(format!("finetune.evaluation.layouts = {found:?}, expected one of {expected}"));
+        }
+        None
+    }
+
+    /// How many evaluations are due after so many steps.
+    pub(super) fn due(&self, policy_steps: u64) -> u64 {
+        policy_steps.checked_div(self.every_steps).map_or(0, |whole| whole + 1)
+    }
+}
 
 /// What a run is.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default, Serialize, Deserialize)]

@@ -3,9 +3,27 @@ use std::path::PathBuf;
 use rcwm_models::settings::{ModelKind, ModelSettings, Preset, SettingsError};
 use serde::{Deserialize, Serialize};
 
-use super::{FewshotSettings, FilmSettings, FinetuneSettings, Phase, ResetSettings};
+use super::{FewshotSettings, FinetuneSettings, Phase, ResetSettings};
 use crate::behaviour::BehaviourSettings;
 use crate::learning::{LookSettings, WorldSettings};
+
+/// Films of the open loop, one a task, with every checkpoint.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields, default)]
+pub struct FilmSettings {
+    /// Steps that are seen before the model imagines.
+    pub context: usize,
+    /// Steps in all; 0 makes no films.
+    pub length: usize,
+    /// Steps from one picture of the strip to the next; the film shows every step.
+    pub every: usize,
+}
+
+impl Default for FilmSettings {
+    fn default() -> Self {
+        Self { context: 10, length: 64, every: 4 }
+    }
+}
 
 /// Everything that can be chosen for a run. The resolved settings are written into its folder.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]

@@ -1,7 +1,17 @@
 use candle_core::{D, DType, Result, Tensor};
 
 use super::{log_softmax, softmax};
-use crate::ops::KlBalance;
+
+/// How a divergence becomes a loss (eq. 3): below `free` nats it costs a constant.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct KlBalance {
+    /// Nats that are free.
+    pub free: f64,
+    /// Weight of the half that trains the prior.
+    pub prior_scale: f64,
+    /// Weight of the half that trains the posterior.
+    pub posterior_scale: f64,
+}
 
 /// Class probabilities with a share of the uniform distribution mixed in: `(1 - u) softmax(logits) + u / m`.
 pub fn probs(logits: &Tensor, unimix: f64) -> Result<Tensor> {

@@ -15,7 +15,8 @@ mod two_hot;
 pub use activation::{log_softmax, sigmoid, softmax};
 pub use attention::cross_attention;
 pub use categorical::{
-    balanced_kl, entropy, log_probs, one_hot_of_best, probs, straight_through_mode, straight_through_sample,
+    KlBalance, balanced_kl, entropy, log_probs, one_hot_of_best, probs, straight_through_mode,
+    straight_through_sample,
 };
 pub use cell::recurrent_update;
 pub use conv::{conv_down, conv_up};
