@@ -1,5 +1,5 @@
 //! No file and no folder imports what imports it (ARCHITECTURE.md, invariants). A module and those inside it count as one house: a
-//! `mod.rs` may use its parts, and they may use what it holds, names that it re-exports included.
+//! `mod.rs` may use its parts, and they may use what it holds. A name that it re-exports counts as where it comes from.
 
 #![allow(clippy::unwrap_used, reason = "a test that fails panics")]
 
@@ -42,9 +42,12 @@ fn modules(folder: &Path, at: &[String], found: &mut BTreeMap<Module, PathBuf>) 
     }
 }
 
-/// The paths that a file names, but for its tests: `crate::a::B` as `[crate, a, B]`.
+/// The paths that a file names, but for its tests: `crate::a::B` as `[crate, a, B]`; and those whose names it re-exports.
 #[derive(Default)]
-struct Named(Vec<Vec<String>>);
+struct Named(Vec<Vec<String>>, Vec<Vec<String>>);
+
+/// Where a module's re-exported names come from, as it writes it.
+type Reexports = BTreeMap<(Module, String), Vec<String>>;
 
 impl Named {
     fn add_tree(&mut self, before: &[String], tree: &syn::UseTree) {
@@ -68,7 +71,11 @@ impl<'ast> Visit<'ast> for Named {
     }
 
     fn visit_item_use(&mut self, item: &'ast syn::ItemUse) {
+        let before = self.0.len();
         self.add_tree(&[], &item.tree);
+        if !matches!(item.vis, syn::Visibility::Inherited) {
+            self.1.extend_from_slice(&self.0[before..]);
+        }
     }
 
     fn visit_path(&mut self, path: &'ast syn::Path) {
@@ -77,32 +84,53 @@ impl<'ast> Visit<'ast> for Named {
     }
 }
 
-/// The module of this crate that a path inside `from` leads to.
-fn resolve(path: &[String], from: &[String], all: &BTreeMap<Module, PathBuf>) -> Option<Module> {
+/// The module of this crate that a path inside `from` leads to, through re-exports.
+fn resolve(
+    path: &[String],
+    from: &[String],
+    all: &BTreeMap<Module, PathBuf>,
+    reexports: &Reexports,
+) -> Option<Module> {
     let supers = path.iter().take_while(|part| *part == "super").count();
-    let mut target: Module = match path.first()?.as_str() {
+    let full: Module = match path.first()?.as_str() {
         "crate" => path[1..].to_vec(),
         "self" => [from, &path[1..]].concat(),
         "super" => [from.get(..from.len().checked_sub(supers)?)?, &path[supers..]].concat(),
+        // A path of a `mod.rs` may begin with one of its own files.
+        own if all.contains_key(&[from, &[own.to_owned()]].concat()) => [from, path].concat(),
         _ => return None,
     };
+    let mut target = full.clone();
     while !all.contains_key(&target) {
         target.pop()?;
     }
-    Some(target)
+    let source = full.get(target.len()).and_then(|name| reexports.get(&(target.clone(), name.clone())));
+    match source {
+        Some(source) if *source != path => resolve(source, &target, all, reexports).or(Some(target)),
+        _ => Some(target),
+    }
 }
 
 fn imports(folder: &Path) -> Graph {
     let mut all = BTreeMap::new();
     modules(folder, &[], &mut all);
-    let of = |module: &Module, path: &PathBuf| {
-        let file = syn::parse_file(&fs::read_to_string(path).unwrap()).unwrap();
+    let read = |path: &PathBuf| {
         let mut named = Named::default();
-        named.visit_file(&file);
-        let targets = named.0.iter().filter_map(|path| resolve(path, module, &all));
-        targets.filter(|target| !target.starts_with(module) && !module.starts_with(target)).collect()
+        named.visit_file(&syn::parse_file(&fs::read_to_string(path).unwrap()).unwrap());
+        named
     };
-    all.iter().map(|(module, path)| (module.clone(), of(module, path))).collect()
+    let named: BTreeMap<_, _> = all.iter().map(|(module, path)| (module, read(path))).collect();
+    let of = |(module, named): (&&Module, &Named)| {
+        let name = |path: &Vec<String>| Some(((*module).clone(), path.last()?.clone()));
+        named.1.iter().filter_map(|path| Some((name(path)?, path.clone()))).collect::<Vec<_>>()
+    };
+    let reexports: Reexports = named.iter().flat_map(of).collect();
+    let of = |(module, named): (&Module, Named)| {
+        let targets = named.0.iter().filter_map(|path| resolve(path, module, &all, &reexports));
+        let others = targets.filter(|target| !target.starts_with(module) && !module.starts_with(target));
+        (module.clone(), others.collect())
+    };
+    named.into_iter().map(of).collect()
 }
 
 /// The same between the folders and files right in the crate.
@@ -152,8 +180,12 @@ fn what_a_file_names_is_found_but_for_its_tests() {
     named.visit_file(&syn::parse_file(text).unwrap());
     let module = |path: &str| path.split("::").map(str::to_owned).collect::<Module>();
     let all = ["a", "b", "b::c", "e", "only"].map(|path| (module(path), PathBuf::new())).into();
-    let found: BTreeSet<_> = named.0.iter().filter_map(|path| resolve(path, &module("a"), &all)).collect();
-    assert_eq!(found, [module("b"), module("b::c"), module("e")].into());
+    let hidden = Reexports::from([((module("e"), "g".to_owned()), module("super::b::c::G"))]);
+    let leads = |reexports: &Reexports| -> BTreeSet<_> {
+        named.0.iter().filter_map(|path| resolve(path, &module("a"), &all, reexports)).collect()
+    };
+    assert_eq!(leads(&Reexports::new()), [module("b"), module("b::c"), module("e")].into());
+    assert_eq!(leads(&hidden), [module("b"), module("b::c")].into(), "a re-exported name is followed");
 }
 
 #[test]

@@ -2,8 +2,8 @@ use std::fmt;
 
 use serde::Serialize;
 
-use super::report::drawn_mean;
 use super::statistics::{Bootstrap, Interval, SEEDS_LEAST};
+use super::task_report::drawn_mean;
 use super::{Measure, Measured, TaskTrajectories};
 
 /// What an interval is over.

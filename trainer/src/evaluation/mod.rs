@@ -38,6 +38,7 @@ mod film;
 mod measures;
 mod motion;
 mod open_loop;
+mod open_loop_settings;
 mod recordings;
 mod report;
 mod response;
@@ -46,6 +47,7 @@ mod robot_dynamics;
 mod seeds;
 mod statistics;
 mod table;
+mod task_report;
 mod trajectories;
 
 pub use attention::{Attention, AttentionFilm, BRIGHTEST_TIMES_EVEN};
@@ -59,16 +61,18 @@ pub use comparison::{Comparison, Over};
 pub use film::Film;
 pub use measures::{Measure, Trace, traces};
 pub use open_loop::{filtered, imagined, joined, open_loop};
+pub use open_loop_settings::{Latents, OpenLoopSettings, Windows};
 pub use recordings::{OTHER_KIND, Recording, Recordings};
-pub use report::{KindReport, ModelReport, OpenLoopReport, Series, Spread, TaskReport};
+pub use report::{ModelReport, OpenLoopReport};
 pub use response::{Answer, Difference, Differences, OtherActions, Response, Share, differences};
 pub use response_film::ResponseFilm;
-pub use robot_dynamics::{Latents, Measured, OpenLoopSettings, measure};
+pub use robot_dynamics::{Measured, measure};
 pub use seeds::{OverSeeds, SeedGroup, SeedRow, Trained};
 pub use statistics::{
     Bootstrap, Interval, SEEDS_LEAST, interval_over_seeds, mean_and_std, mean_over_seeds, wilson,
 };
-pub use trajectories::{TaskTrajectories, Trajectory, Windows};
+pub use task_report::{KindReport, Series, Spread, TaskReport};
+pub use trajectories::{TaskTrajectories, Trajectory};
 
 use crate::plots::PlotError;
 use crate::replay::ReplayError;

@@ -1,80 +1,18 @@
 use std::sync::atomic::{AtomicBool, Ordering};
 
-use candle_core::Device;
-use serde::{Deserialize, Serialize};
-
 use super::attention::maps_of;
 use super::open_loop::{filtered, joined};
 use super::response::{Differences, differences};
 use super::{
-    AttentionMaps, AttentionSpread, EvaluationError, Film, Measure, OtherActions, ResponseFilm,
-    TaskTrajectories, Trace, Windows, traces,
+    AttentionMaps, AttentionSpread, EvaluationError, Film, Latents, Measure, OpenLoopSettings, ResponseFilm,
+    TaskTrajectories, Trace, traces,
 };
 use crate::model::agent::Agent;
 use crate::model::latent::{Sampler, State};
+use candle_core::Device;
 
 /// Trajectories at a time: bounds the memory of the decoded pictures.
 const ROWS: usize = 10;
-
-/// How latents are chosen from their distributions.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
-#[serde(rename_all = "lowercase")]
-pub enum Latents {
-    /// Drawn, by the seed.
-    Sample,
-    /// The most probable class.
-    Mode,
-}
-
-impl Latents {
-    /// Its name in files and on the command line.
-    #[must_use]
-    pub const fn name(self) -> &'static str {
-        match self {
-            Self::Sample => "sample",
-            Self::Mode => "mode",
-        }
-    }
-}
-
-/// How models are measured.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
-#[serde(deny_unknown_fields, default)]
-pub struct OpenLoopSettings {
-    /// Trajectories a task.
-    pub trajectories: usize,
-    /// Steps that are seen.
-    pub context: usize,
-    /// Steps that are imagined after them.
-    pub imagined: usize,
-    /// How latents are chosen.
-    pub latents: Latents,
-    /// Seed of trajectories, draws and intervals.
-    pub seed: u64,
-    /// Films a task and model.
-    pub films: usize,
-    /// Which stretches of episodes.
-    #[serde(default = "Windows::of_older_files")]
-    pub windows: Windows,
-    /// What is done in place of the recorded actions to see what depends on them; none in files from before it was measured.
-    pub other_actions: Option<OtherActions>,
-}
-
-impl Default for OpenLoopSettings {
-    /// Sizes are the paper's (Fig. 4).
-    fn default() -> Self {
-        Self {
-            trajectories: 100,
-            context: 10,
-            imagined: 54,
-            latents: Latents::Sample,
-            seed: 0,
-            films: 2,
-            windows: Windows::Moving,
-            other_actions: Some(OtherActions::Still),
-        }
-    }
-}
 
 /// A model on a task's trajectories: a trace each, of the steps after the context.
 #[derive(Debug, Default)]

@@ -2,47 +2,18 @@ use std::collections::BTreeMap;
 use std::ops::Range;
 use std::sync::Arc;
 
+use super::motion::robot_moves;
+use super::{EvaluationError, OpenLoopSettings, Recording, Recordings, Windows};
+use crate::learning::{Batch, HostBatch};
+use crate::replay::append_steps;
 use candle_core::Device;
 use rand::seq::{SliceRandom, index};
 use rand::{Rng, SeedableRng};
 use rand_chacha::ChaCha8Rng;
 use rcwm_models::episode::Episode;
-use serde::{Deserialize, Serialize};
-
-use super::motion::robot_moves;
-use super::{EvaluationError, OpenLoopSettings, Recording, Recordings};
-use crate::learning::{Batch, HostBatch};
-use crate::replay::append_steps;
 
 /// Imagined steps that a window must have at least where it ends with success: as many as behaviour is learnt from.
 const IMAGINED_LEAST: usize = 15;
-
-/// Which stretches of episodes are taken.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
-#[serde(rename_all = "lowercase")]
-pub enum Windows {
-    /// Those that end before the step at which the task is first solved, and in which the robot moves at half of the imagined steps
-    /// or more. Where success comes early they are shorter, but not below 15 imagined steps.
-    Moving,
-    /// All, also those in which the robot holds still or that go on after success.
-    Anywhere,
-}
-
-impl Windows {
-    /// Its name in files and on the command line.
-    #[must_use]
-    pub const fn name(self) -> &'static str {
-        match self {
-            Self::Moving => "moving",
-            Self::Anywhere => "anywhere",
-        }
-    }
-
-    /// What files say in which there is nothing about it.
-    pub(super) const fn of_older_files() -> Self {
-        Self::Anywhere
-    }
-}
 
 /// A stretch of an episode.
 #[derive(Debug, Clone)]

@@ -17,6 +17,7 @@
 //! | `sections` | what stands on the page |
 //! | `html` | pictures, tables and intervals in HTML |
 
+mod draw;
 mod dynamics;
 mod html;
 mod learning;

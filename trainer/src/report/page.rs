@@ -1,13 +1,11 @@
-use std::path::Path;
-
-use maud::{Markup, html};
-use rcwm_models::files::{read_capped, write_atomic};
+use maud::Markup;
+use rcwm_models::files::read_capped;
 use rcwm_models::settings::ModelKind;
 use serde::Serialize;
 
 use super::{
     AttentionPart, Dynamics, Learning, LearningCurve, Part, Pooled, Provenance, ReportError, Results, Store,
-    Success, SuccessComparison, html, pooled, sections, success,
+    Success, SuccessComparison, html, pooled, success,
 };
 use crate::evaluation::{Comparison, OverSeeds, Trained};
 
@@ -102,37 +100,6 @@ impl Report {
             learning,
             store: store.clone(),
         })
-    }
-
-    /// Writes `index.html` and `report.json` into the report's folder.
-    pub fn write(&self, folder: &Path) -> Result<(), ReportError> {
-        let page = self.html()?;
-        let mut text = serde_json::to_vec_pretty(self).map_err(ReportError::Json)?;
-        text.push(b'\n');
-        write_atomic(&folder.join("report.json"), &text)?;
-        Ok(write_atomic(&folder.join("index.html"), page.as_bytes())?)
-    }
-
-    /// The page.
-    ///
-    /// # Errors
-    /// Those of reading and drawing pictures.
-    pub fn html(&self) -> Result<String, ReportError> {
-        let sections = sections::all(self)?;
-        let body = html! {
-            header {
-                h1 { "RCWM: what the models can do" }
-                p.soft {
-                    "Drawn " (self.made.date) " by rcwm-trainer " (self.made.version) " (" (self.made.revision) ") on "
-                    (self.made.processor) ", " (self.made.cores) " cores."
-                }
-                nav { @for section in &sections { a href={ "#" (section.id) } { (section.title) } } }
-            }
-            main { @for section in &sections {
-                section id=(section.id) { h2 { (section.title) } (section.body) }
-            } }
-        };
-        Ok(html::page("RCWM: what the models can do", &body))
     }
 
     /// One of a part's pictures.
