@@ -203,7 +203,7 @@ impl Progress for Bar {
         }
         self.bar.set_length(total as u64);
         self.bar.set_position(done as u64);
-        self.bar.set_message(what.to_owned());
+        self.bar.set_message(what);
         Ok(())
     }
 }
