@@ -1,7 +1,7 @@
 //! The archive behind an episode file. Shapes are checked before numbers are unpacked, so that a header cannot ask for more memory
 //! than an episode may take.
 
-use std::io::{BufReader, Cursor, Write};
+use std::io::{BufReader, Cursor, Read, Write};
 use std::path::Path;
 
 use ndarray::{Array1, Array4, ArrayD, Dimension, Ix1, Ix2, Ix3, Ix4};
@@ -44,6 +44,21 @@ impl Reader<'_> {
 
     /// The array of this name, if it is there, of shape `[T, axes]`; axes of length 1 may be left out or be more.
     fn array(&mut self, key: &'static str, axes: &[usize]) -> Result<Option<Array>, EpisodeError> {
+        self.entry(key, axes, |header, mut from| header.read_numbers(&mut from))
+    }
+
+    /// Its shape, without unpacking its numbers.
+    fn shape(&mut self, key: &'static str, axes: &[usize]) -> Result<Option<Vec<usize>>, EpisodeError> {
+        self.entry(key, axes, |header, _| Ok(header.shape))
+    }
+
+    /// What `read` makes of an array whose header fits.
+    fn entry<T>(
+        &mut self,
+        key: &'static str,
+        axes: &[usize],
+        read: impl FnOnce(Header, &mut dyn Read) -> Result<T, String>,
+    ) -> Result<Option<T>, EpisodeError> {
         let mut entry = match self.archive.by_name(&format!("{key}.npy")) {
             Ok(entry) => entry,
             Err(zip::result::ZipError::FileNotFound) => return Ok(None),
@@ -53,11 +68,11 @@ impl Reader<'_> {
             }
         };
         let steps = self.steps;
-        let read = Header::read(&mut entry).and_then(|mut header| {
+        let found = Header::read(&mut entry).and_then(|mut header| {
             header.shape = fitted(&header.shape, steps, axes).ok_or_else(|| {
                 format!("of shape {:?}{}", header.shape, channels_first(&header.shape, axes))
             })?;
-            header.read_numbers(&mut entry)
+            read(header, &mut entry)
         });
         drop(entry);
         let (steps, most) = match steps {
@@ -66,7 +81,23 @@ impl Reader<'_> {
         };
         let sizes: Vec<_> = std::iter::once(steps).chain(axes.iter().map(usize::to_string)).collect();
         let expected = format!("numbers of shape [{}]{most}", sizes.join(", "));
-        read.map(Some).map_err(|found| self.wrong(key, found, expected))
+        found.map(Some).map_err(|found| self.wrong(key, found, expected))
+    }
+
+    /// Whether every array that is read is there and fits the images, before any of them is unpacked.
+    fn check_shapes(&mut self) -> Result<(), EpisodeError> {
+        let image = [IMAGE_SIDE, IMAGE_SIDE, IMAGE_CHANNELS];
+        let shape = self.shape("image", &image)?.ok_or_else(|| self.missing("image"))?;
+        self.steps = shape.first().copied();
+        for (key, axes) in [("action", &[ACTION_LEN][..]), ("reward", &[]), ("is_first", &[])] {
+            self.shape(key, axes)?.ok_or_else(|| self.missing(key))?;
+        }
+        for key in ["is_terminal", "is_last", "success", "pushed"] {
+            self.shape(key, &[])?;
+        }
+        self.shape("robot_mask", &image[..2])?;
+        self.shape("proprio", &[PROPRIOCEPTION_LEN])?;
+        self.shape(DISTURBED, &image).map(drop)
     }
 
     /// Numbers of any type; all must be finite.
@@ -154,9 +185,9 @@ pub(super) fn read(path: &Path, bytes: &[u8]) -> Result<Episode, EpisodeError> {
     };
     let archive = ZipArchive::new(Cursor::new(bytes)).map_err(broken)?;
     let mut reader = Reader { path, archive, steps: None };
+    reader.check_shapes()?;
     let image = read_images(&mut reader, "image")?.ok_or_else(|| reader.missing("image"))?;
     let steps = image.shape()[0];
-    reader.steps = Some(steps);
     let action = reader.floats::<Ix2>("action", &[ACTION_LEN])?.ok_or_else(|| reader.missing("action"))?;
     let reward = reader.floats::<Ix1>("reward", &[])?.ok_or_else(|| reader.missing("reward"))?;
     let is_first = reader.flags("is_first")?.ok_or_else(|| reader.missing("is_first"))?;
@@ -285,6 +316,16 @@ mod tests {
             foreign.set(key, descr, shape, bytes);
             foreign.read()
         }
+    }
+
+    #[test]
+    fn what_does_not_fit_is_refused_before_any_array_is_unpacked() {
+        // Pictures whose header asks for 1 GiB, of which none is there.
+        let mut foreign = Foreign::new();
+        foreign.set("image", "|u1", &[STEPS_MAX, 64, 64, 3], &[]);
+        assert!(foreign.read().unwrap_err().contains("\"action\""), "{:?}", foreign.read().err());
+        foreign.0.retain(|(name, _)| name != "action");
+        assert!(foreign.read().unwrap_err().contains("array \"action\" is missing"));
     }
 
     #[test]
