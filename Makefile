@@ -20,12 +20,12 @@ help: ## What there is
 
 demo: ## A trained policy (TASK=hammer) over shared memory: summary and films in runs/demo
 	@scripts/setup demo
-	$(CARGO) build --release --locked -p rcwm-simulator -p rcwm-runtime
+	$(CARGO) build --release --locked -p rcwm-simulator -p rcwm-runtime -p rcwm-lab
 	@scripts/demo "$(BUNDLE)" "$(TASK)" "$(EPISODES)" "$(OUT)" "$(SEED)"
 
 learn: ## A new task (TASK=coffee-pull) from 50 demonstrations, deployed and scored: policy, film and figures in runs/learn/TASK
 	@scripts/setup demo
-	$(CARGO) build --release --locked -p rcwm-simulator -p rcwm-runtime -p rcwm-trainer
+	$(CARGO) build --release --locked -p rcwm-simulator -p rcwm-runtime -p rcwm-lab -p rcwm-trainer
 	@scripts/learn "$(TASK)" "$(PRETRAINED)" "$(LEARNT)" "$(DEMONSTRATIONS)" 50 "$(DEMONSTRATOR)"
 
 test: ## Everything that can be tested on one machine

@@ -13,11 +13,10 @@
 //! | [`realtime`] | what Linux grants a thread that must be on time |
 //! | [`telemetry`] | latency histograms, one per stage |
 //! | [`swap`] | another policy in place of the running one |
-//! | [`record`] | films, strips and episodes of what the policy saw, written beside the loop |
-//! | [`mod@log`] | every tick of a run, replayed bit for bit or turned into episodes |
+//! | [`record`] | one record a tick, from the loop to the thread that writes |
+//! | [`mod@log`] | every tick of a run in a file |
+//! | [`snapshots`] | a JSON line every so often |
 //! | [`verify`] | a bundle against its golden values |
-//! | [`inspect`] | what a bundle holds and what a tick costs |
-//! | [`mod@bench`] | the tick's latency on this machine, engines interleaved |
 //!
 //! A policy without shared memory:
 //!
@@ -39,12 +38,10 @@
 //!
 //! This crate never links candle or Python.
 
-pub mod bench;
 pub mod cli;
 pub mod compile;
 pub mod controller;
 pub mod engine;
-pub mod inspect;
 pub mod log;
 pub mod operators;
 pub mod pacing;

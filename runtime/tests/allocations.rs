@@ -2,16 +2,14 @@
 
 #![allow(clippy::unwrap_used, reason = "a test that fails panics")]
 
-mod support;
-
 use rcwm_models::bundle::Bundle;
 use rcwm_models::onnx::data_type;
 use rcwm_runtime::compile::{Optimizations, Segment, compile};
 use rcwm_runtime::engine::EngineKind;
 use rcwm_runtime::policy::Sampling;
 use rcwm_runtime::{EngineSettings, Policy, operators};
-use support::counting::{Counting, allocations};
-use support::{image, smallest_bundle};
+use rcwm_testkit::counting::{Counting, allocations};
+use rcwm_testkit::{image, smallest_bundle};
 use tract_onnx::prelude::*;
 use tract_onnx::tract_core::plan::eval;
 

@@ -2,16 +2,14 @@
 
 #![allow(clippy::unwrap_used, reason = "a test that fails panics")]
 
-mod support;
-
 use rcwm_models::bundle::{Bundle, PartName};
 use rcwm_runtime::compile::{Optimizations, compile};
 use rcwm_runtime::engine::{EngineKind, Form};
 use rcwm_runtime::policy::Sampling;
 use rcwm_runtime::{EngineSettings, Policy};
+use rcwm_testkit::{image, smallest_bundle};
 use rustix::process::Pid;
 use rustix::thread::{CpuSet, sched_getaffinity, sched_getcpu, sched_setaffinity};
-use support::{image, smallest_bundle};
 
 fn policy(bundle: &Bundle, settings: EngineSettings) -> Policy {
     Policy::new(bundle, settings, Sampling::Sample { seed: 3 }).unwrap()

@@ -1,14 +1,12 @@
 //! The controller against a real peer on a real link.
 
-mod support;
-
 use rcwm_models::bundle::PartName;
 use rcwm_models::wire::{ActionSource, ObservationFlags};
 use rcwm_runtime::controller::{Ended, Fallback};
 use rcwm_runtime::pacing::PacingSettings;
 use rcwm_runtime::telemetry::Stage;
 use rcwm_runtime::{EngineSettings, Policy};
-use support::{
+use rcwm_testkit::{
     ask, dividing_by_zero, image, observation, own_link, smallest_bundle, start_controller,
     start_controller_with, with_manifest,
 };

@@ -2,12 +2,10 @@
 
 #![allow(clippy::unwrap_used, reason = "a test that fails panics")]
 
-mod support;
-
 use std::process::{Command, Output};
 
 use rcwm_runtime::controller::{Fallback, Pace};
-use support::{own_link, smallest_bundle, start_controller};
+use rcwm_testkit::{own_link, smallest_bundle, start_controller};
 
 /// An example of this package, which `cargo test` builds beside its tests.
 fn example(name: &str) -> Command {

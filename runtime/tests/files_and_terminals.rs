@@ -2,8 +2,6 @@
 
 #![allow(clippy::unwrap_used, reason = "a test that fails panics")]
 
-mod support;
-
 use std::fs;
 use std::path::{Path, PathBuf};
 use std::process::{Command, Output, Stdio};
@@ -12,7 +10,7 @@ use std::thread::JoinHandle;
 use rcwm_models::episode::Episode;
 use rcwm_models::tasks::task_id;
 use rcwm_models::wire::{Observation, ObservationFlags, SimulatorLink};
-use support::{OwnLink, ask, observation, own_link, smallest_bundle};
+use rcwm_testkit::{OwnLink, ask, observation, own_link, smallest_bundle};
 
 /// Standard output whose reader is gone.
 fn closed() -> Stdio {
@@ -211,7 +209,7 @@ fn a_second_run_in_a_folder_or_file_that_is_in_use_is_refused() {
 #[test]
 fn a_robot_of_another_task_and_rate_is_remarked_and_in_the_json() {
     let folder = tempfile::tempdir().unwrap();
-    let bundle = support::with_manifest(|manifest| manifest.task = "hammer".into());
+    let bundle = rcwm_testkit::with_manifest(|manifest| manifest.task = "hammer".into());
     let json = folder.path().join("run.json");
     let robot = Robot::playing(8, |sent| sent.task = task_id("reach").unwrap());
     let mut arguments = vec!["--json", json.to_str().unwrap()];

@@ -2,31 +2,26 @@
 
 #![allow(clippy::unwrap_used, reason = "a test that fails panics")]
 
-mod support;
-
-use std::time::Duration;
-
 use rcwm_models::wire::Action;
 use rcwm_runtime::controller::{Counters, EpisodeResult, Episodes, State, Tick, TickObserver, TickTimes};
-use rcwm_runtime::log::{LogSettings, Logger};
+use rcwm_runtime::log::{LogSettings, LogWriter};
 use rcwm_runtime::policy::Sampling;
-use rcwm_runtime::snapshots::{SnapshotSettings, Snapshots};
+use rcwm_runtime::record::{Finished, Recorder};
 use rcwm_runtime::telemetry::{Stage, Telemetry};
 use rcwm_runtime::{EngineSettings, Policy};
-use support::counting::{Counting, allocations};
-use support::{observation, smallest_bundle};
+use rcwm_testkit::counting::{Counting, allocations};
+use rcwm_testkit::{observation, smallest_bundle};
 
 #[global_allocator]
 static COUNTING: Counting = Counting;
 
 #[test]
-fn logging_and_snapshots_allocate_nothing_in_the_loop_s_thread() {
+fn a_record_allocates_nothing_in_the_loop_s_thread() {
     let folder = tempfile::tempdir().unwrap();
     let mut policy = Policy::load(&smallest_bundle(), EngineSettings::tract()).unwrap();
     let settings = LogSettings::new("test", EngineSettings::tract(), Sampling::Mode);
-    let mut logger = Logger::start(&folder.path().join("log"), &policy, settings).unwrap();
-    let file = folder.path().join("snapshots.jsonl");
-    let mut snapshots = Snapshots::start(SnapshotSettings { file, every: Duration::from_secs(1) }).unwrap();
+    let log = LogWriter::start(&folder.path().join("log"), &policy, settings).unwrap();
+    let mut recorder = Recorder::start(&policy, log).unwrap();
     let (mut telemetry, counters) = (Telemetry::new(), Counters::default());
     for step in 0..300 {
         let mut observation = observation(u64::from(step), step);
@@ -57,14 +52,11 @@ fn logging_and_snapshots_allocate_nothing_in_the_loop_s_thread() {
             episodes: &Episodes::default(),
             running: EpisodeResult::start(&observation),
         };
-        let (count, ()) = allocations(|| {
-            logger.ticked(&tick);
-            snapshots.ticked(&tick);
-        });
+        let (count, ()) = allocations(|| recorder.ticked(&tick));
         assert_eq!(count, 0, "step {step}");
     }
     assert_eq!(allocations(|| drop(std::hint::black_box(Box::new(1_u8)))).0, 1, "allocations are counted");
-    let summary = logger.finish().unwrap();
-    snapshots.finish().unwrap();
+    let Finished { sink, dropped } = recorder.finish().unwrap();
+    let summary = sink.finish(dropped).unwrap();
     assert_eq!(summary.ticks + summary.dropped, 300);
 }

@@ -2,13 +2,11 @@
 
 #![allow(clippy::unwrap_used, reason = "a test that fails panics")]
 
-mod support;
-
 use rcwm_models::IMAGE_BYTES;
 use rcwm_models::bundle::{Bundle, PartName};
 use rcwm_runtime::policy::Sampling;
 use rcwm_runtime::{EngineError, EngineSettings, Policy, PolicyError};
-use support::{image, smallest_bundle, with_nan_weight};
+use rcwm_testkit::{image, smallest_bundle, with_nan_weight};
 
 const EXECUTED: [f32; 4] = [0.1, -0.4, 0.2, -1.0];
 

@@ -2,8 +2,6 @@
 
 #![allow(clippy::unwrap_used, reason = "a test that fails panics")]
 
-mod support;
-
 use std::sync::atomic::AtomicBool;
 use std::time::{Duration, Instant};
 
@@ -15,7 +13,7 @@ use rcwm_runtime::controller::{
 use rcwm_runtime::policy::Sampling;
 use rcwm_runtime::swap::{self, Answer, SwapSettings, Swapper, When};
 use rcwm_runtime::{EngineKind, EngineSettings, Policy};
-use support::{
+use rcwm_testkit::{
     NEVER, PERIOD_NS, ask, due_now, observation, own_link, smallest_bundle, start_changed,
     start_controller_with, with_manifest,
 };

@@ -3,16 +3,14 @@
 
 #![allow(clippy::unwrap_used, reason = "a test that fails panics")]
 
-mod support;
-
 use std::process::{Child, Stdio};
 use std::sync::atomic::AtomicBool;
 use std::time::{Duration, Instant};
 
 use rcwm_models::wire::Wait;
 use rcwm_runtime::swap::{Answer, When, ask};
+use rcwm_testkit::{OwnLink, observation, own_link, smallest_bundle};
 use rustix::process::{Pid, Signal, kill_process};
-use support::{OwnLink, observation, own_link, smallest_bundle};
 
 /// Far longer than anything here takes.
 const NEVER: Duration = Duration::from_secs(20);
@@ -68,7 +66,7 @@ fn neither_who_asks_nor_the_end_of_the_run_waits_for_a_server_that_does_not_get_
     let link = own_link();
     let peer = link.peer();
     let mut run = start(&link);
-    support::ask(&peer, &observation(0, 0));
+    rcwm_testkit::ask(&peer, &observation(0, 0));
     let server = thread_of(&run, "swap");
     if !hold(server) {
         eprintln!("left out: this system does not let a program hold a thread of its child");
@@ -84,7 +82,7 @@ fn neither_who_asks_nor_the_end_of_the_run_waits_for_a_server_that_does_not_get_
     });
     assert_eq!((answer.unwrap(), heard), (Answer::Withdrawn, vec![]));
     // The run itself goes on.
-    support::ask(&peer, &observation(1, 1));
+    rcwm_testkit::ask(&peer, &observation(1, 1));
     peer.poll_events().unwrap();
     kill_process(Pid::from_child(&run), Signal::TERM).unwrap();
     let mut told = false;

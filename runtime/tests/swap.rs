@@ -2,8 +2,6 @@
 
 #![allow(clippy::unwrap_used, reason = "a test may panic")]
 
-mod support;
-
 use std::path::Path;
 use std::sync::atomic::{AtomicBool, Ordering};
 use std::thread::JoinHandle;
@@ -15,7 +13,7 @@ use rcwm_runtime::controller::{Controller, ControllerSettings, RunReport, TickLi
 use rcwm_runtime::policy::Sampling;
 use rcwm_runtime::swap::{Answer, SwapError, SwapSettings, Swapper, When, ask, name_of_server};
 use rcwm_runtime::{EngineKind, EngineSettings, Policy};
-use support::{
+use rcwm_testkit::{
     OwnLink, dividing_by_zero, own_link, smallest_bundle, too_small_for_16_bits, with_manifest,
     with_nan_weight,
 };
@@ -41,7 +39,7 @@ fn start_with_limits(link: &OwnLink, engine: EngineSettings, ticks: TickLimits) 
     };
     let swapper = Swapper::start(settings).unwrap();
     let change = |settings: &mut ControllerSettings| settings.ticks = ticks;
-    support::start_changed(policy, link, change, move |controller: &mut Controller| {
+    rcwm_testkit::start_changed(policy, link, change, move |controller: &mut Controller| {
         controller.take_swaps(swapper);
         let ended = controller.run(&AtomicBool::new(false), &mut []).unwrap();
         controller.report(EngineKind::Tract, ended)
@@ -67,10 +65,10 @@ impl Peer<'_> {
 
     /// One observation, and the action that answers it: the policy's own, whatever happens beside it.
     fn tick(&mut self) -> [f32; 4] {
-        let mut observation = support::observation(self.sequence, self.step());
+        let mut observation = rcwm_testkit::observation(self.sequence, self.step());
         observation.episode = self.sequence / EPISODE;
         observation.flags |= if self.step() == 19 { ObservationFlags::LAST.0 } else { 0 };
-        let answer = support::ask(self.link, &observation);
+        let answer = rcwm_testkit::ask(self.link, &observation);
         assert_eq!(answer.source, ActionSource::Policy as u32, "sequence {}", self.sequence);
         self.sequence += 1;
         answer.action
@@ -127,8 +125,8 @@ fn a_bundle_taken_at_once_starts_from_its_initial_state_in_the_middle_of_an_epis
     assert!(matches!(answer, Answer::Taken { .. }), "{answer:?}");
     let mut policy = Policy::load(&smallest_bundle(), EngineSettings::tract()).unwrap();
     for step in 5..10 {
-        let executed = support::observation(step, step as u32).executed_action;
-        let image = support::image(step as u32);
+        let executed = rcwm_testkit::observation(step, step as u32).executed_action;
+        let image = rcwm_testkit::image(step as u32);
         let expected = policy.observe(&image, (step > 5).then_some(&executed)).unwrap();
         assert_eq!(peer_ticks.tick(), expected.action, "step {step}");
     }
@@ -142,12 +140,12 @@ fn a_policy_that_has_seen_nothing_yet_is_stood_in_for_by_as_many_fallbacks_as_al
     let peer = link.peer();
     let ticks = TickLimits { imagined_ticks_max: 2, fallback_ticks_max: 3 };
     let controller = start_with_limits(&link, EngineSettings::tract(), ticks);
-    support::ask(&peer, &support::observation(0, 0));
+    rcwm_testkit::ask(&peer, &rcwm_testkit::observation(0, 0));
     let answer = ask_aside(&link, &smallest_bundle(), When::Now).join().unwrap().unwrap();
     assert!(matches!(answer, Answer::Taken { .. }), "{answer:?}");
     // The same again, from which on the next ones are due, and do not come.
-    support::ask(&peer, &support::due_now(0));
-    std::thread::sleep(Duration::from_nanos(10 * support::PERIOD_NS));
+    rcwm_testkit::ask(&peer, &rcwm_testkit::due_now(0));
+    std::thread::sleep(Duration::from_nanos(10 * rcwm_testkit::PERIOD_NS));
     peer.close().unwrap();
     let counters = controller.join().unwrap().counters;
     assert_eq!((counters.imagined_answers, counters.fallback_answers), (0, 3), "{counters:?}");
@@ -164,7 +162,7 @@ fn a_bad_bundle_is_refused_with_one_line_and_the_old_one_runs_on() {
     let damaged = with_manifest(|manifest| manifest.parts[1].sha256.replace_range(..1, "x"));
     let sizes = with_manifest(|manifest| manifest.model.deter *= 2);
     let action = with_manifest(|manifest| manifest.model.action = 7);
-    let golden = support::with_golden(|mean| mean + 0.01);
+    let golden = rcwm_testkit::with_golden(|mean| mean + 0.01);
     let missing = tempfile::tempdir().unwrap();
     for (bundle, word) in [
         (with_nan_weight(PartName::Robot), "NaN"),

@@ -2,8 +2,6 @@
 
 #![allow(clippy::unwrap_used, reason = "a test that fails panics")]
 
-mod support;
-
 use std::cell::Cell;
 use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, Ordering};
@@ -18,7 +16,7 @@ use rcwm_runtime::controller::{
     TickLimits, Transport,
 };
 use rcwm_runtime::{EngineKind, EngineSettings, Policy};
-use support::{
+use rcwm_testkit::{
     NEVER, PERIOD_NS, ask, dividing_by_zero, due_now, image, observation, own_link, smallest_bundle,
     start_controller_with,
 };

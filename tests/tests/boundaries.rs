@@ -8,6 +8,7 @@ use rcwm_tests::{binary, output, root};
 const CANDLE: &[&str] = &["candle-core", "candle-nn"];
 const TRACT: &[&str] = &["tract-core", "tract-onnx"];
 const PYTHON: &[&str] = &["pyo3", "pyo3-ffi"];
+const DRAWING: &[&str] = &["image", "plotters", "gif", "png", "color_quant"];
 
 /// What cargo would build for these packages, a line each in this format.
 fn tree(packages: &[&str], edges: &str, format: &str) -> Vec<String> {
@@ -51,8 +52,13 @@ fn the_kernels_depend_on_no_engine_and_no_python() {
 }
 
 #[test]
-fn the_runtime_depends_on_neither_candle_nor_python() {
-    assert_without("rcwm-runtime", &[CANDLE, PYTHON]);
+fn what_runs_on_a_robot_depends_on_neither_candle_nor_python_and_draws_nothing() {
+    assert_without("rcwm-runtime", &[CANDLE, PYTHON, DRAWING]);
+}
+
+#[test]
+fn the_lab_depends_on_neither_candle_nor_python() {
+    assert_without("rcwm-lab", &[CANDLE, PYTHON]);
 }
 
 #[test]
@@ -67,8 +73,8 @@ fn the_simulator_depends_on_neither_candle_nor_tract() {
 
 #[test]
 fn what_the_demo_compiles_is_not_compiled_again_for_learning() {
-    let demo = ["rcwm-simulator", "rcwm-runtime"];
-    let learning = [demo[0], demo[1], "rcwm-trainer"];
+    let demo = ["rcwm-simulator", "rcwm-runtime", "rcwm-lab"];
+    let learning = [demo[0], demo[1], demo[2], "rcwm-trainer"];
     // What is linked, and all that is built, procedural macros included: a crate may be both, with other features.
     for edges in ["normal,no-proc-macro", "normal,build"] {
         let with_features = |packages: &[&str]| tree(packages, edges, "{p} with {f}");

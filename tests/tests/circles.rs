@@ -15,6 +15,7 @@ const CRATES: &[&str] = &[
     "models/src",
     "runtime/src",
     "runtime/kernels/src",
+    "runtime/lab/src",
     "trainer/src",
     "trainer/gpu/src",
     "trainer/simulator/src",

@@ -16,7 +16,7 @@ fn examples_that_need_only_what_is_shipped_run_as_they_stand() {
         std::os::unix::fs::symlink(root().join(shipped), folder.path().join(shipped)).unwrap();
     }
     let mut run = 0;
-    for program in ["rcwm-runtime", "rcwm-trainer", "rcwm-simulator"] {
+    for program in ["rcwm-runtime", "rcwm-lab", "rcwm-trainer", "rcwm-simulator"] {
         for verb in RUNNABLE {
             let mut help = domain.command(program);
             let help = help.args([verb, "--help"]).output().unwrap();

@@ -29,7 +29,7 @@ fn a_logged_run_is_replayed_bit_for_bit_and_the_trainer_learns_from_it() {
     simulator.succeed();
     run.succeed();
 
-    let mut replay = domain.command("rcwm-runtime");
+    let mut replay = domain.command("rcwm-lab");
     replay.args(["replay", "--bundle"]).arg(shipped_bundle()).arg("--log").arg(at("run.rcwmlog"));
     replay.arg("--episodes").arg(at("data")).arg("--json").arg(at("replay.json"));
     let mut replay = Running::start(replay);

@@ -1,30 +1,36 @@
-//! What looks on while `run` goes on, and what it leaves behind: films, a log, snapshots, latencies.
+//! What is recorded while `run` goes on, and what is made of it afterwards: films, a log, snapshots, latencies.
 
 use std::path::{Path, PathBuf};
+use std::process::Command;
 use std::time::Duration;
 
 use anyhow::Context;
 use clap::Args;
-use rcwm_models::bundle::Bundle;
 use rcwm_models::files::free_name;
+use rcwm_models::lock::Lock;
 
+use super::status::StatusLine;
+use super::{lab, shared};
 use crate::controller::{Pace, RunReport, TickObserver};
-use crate::log::{LogError, LogSettings, LogSummary, Logger};
+use crate::log::{LogError, LogSettings, LogSummary, LogWriter};
 use crate::policy::Policy;
-use crate::record::{Recorded, Recorder};
+use crate::record::{Finished, Record, Recorder, Sink};
 use crate::snapshots::{SnapshotSettings, Snapshots};
 use crate::telemetry::{LatencyFiles, Telemetry};
+
+/// Name of the log from which films are drawn, in their folder.
+const LOG_FOR_FILMS: &str = "run.rcwmlog";
 
 /// What is to be written.
 #[derive(Debug, Args)]
 pub(super) struct ObserverArguments {
-    /// Records films, strips and episodes into this folder
+    /// Logs into this folder, and draws films, strips and episodes from the log after the run (rcwm-lab film)
     #[arg(long, value_name = "DIR")]
     record: Option<PathBuf>,
     /// Records at most this many episodes
     #[arg(long, value_name = "N", default_value_t = 3, requires = "record")]
     record_episodes: u64,
-    /// Logs every tick to this file, for `rcwm-runtime replay`; where it exists, to another: FILE-2, FILE-3, ...
+    /// Logs every tick to this file, for `rcwm-lab replay`; where it exists, to another: FILE-2, FILE-3, ...
     #[arg(long, value_name = "FILE")]
     log: Option<PathBuf>,
     /// Appends a JSON line to this file every so often: counts, latencies and surprise of the last interval and in total
@@ -53,24 +59,17 @@ fn interval(text: &str) -> Result<Duration, String> {
     }
 }
 
-/// Everything that looks on.
-pub(super) struct Observers {
-    recorder: Option<Recorder>,
-    logger: Option<Logger>,
-    snapshots: Option<Snapshots>,
-}
-
-/// What they have left behind.
-pub(super) struct Left {
-    recorded: Recorded,
-    log: Option<LogSummary>,
-}
-
 impl ObserverArguments {
     /// Makes sure before the run that everything can be written, and each to a file of its own.
     pub(super) fn prepare(&self, json: Option<&Path>) -> anyhow::Result<()> {
-        super::prepare_json(json)?;
+        shared::prepare_json(json)?;
         self.latency_files.prepare()?;
+        if self.record.is_some() {
+            lab::prepare("--record")?;
+        }
+        if self.latency_files.plot.is_some() {
+            lab::prepare("--plot")?;
+        }
         for (option, file) in [("--log", &self.log), ("--telemetry", &self.telemetry)] {
             let folder =
                 file.as_deref().and_then(Path::parent).filter(|folder| !folder.as_os_str().is_empty());
@@ -94,26 +93,21 @@ impl ObserverArguments {
         }
         Ok(())
     }
-
-    /// Whether films and episodes are asked for.
-    pub(super) fn records(&self) -> bool {
-        self.record.is_some()
-    }
 }
 
 /// Starts a log; one that is there stays as it is, so that a run that is started again after a crash comes back.
-fn start_log(file: &Path, policy: &Policy, log: &LogSettings) -> Result<Logger, LogError> {
+fn start_log(file: &Path, policy: &Policy, log: &LogSettings) -> Result<LogWriter, LogError> {
     if file.exists() && !file.is_file() {
         let source = std::io::Error::other("a folder or a device; expected the name of a new file");
         return Err(LogError::Io { path: file.to_path_buf(), source });
     }
     loop {
         let free = free_name(file, |name| !name.exists());
-        match Logger::start(&free, policy, log.clone()) {
+        match LogWriter::start(&free, policy, log.clone()) {
             // Another run was faster; the next name.
             Err(LogError::Exists { .. }) => {}
             started => {
-                if free != file {
+                if free != file && log.episodes_max.is_none() {
                     rcwm_models::errln!("{} is kept; this run's log is {}", file.display(), free.display());
                 }
                 return started;
@@ -122,67 +116,102 @@ fn start_log(file: &Path, policy: &Policy, log: &LogSettings) -> Result<Logger, 
     }
 }
 
-impl Observers {
-    pub(super) fn start(
-        arguments: &ObserverArguments,
-        bundle: &Bundle,
-        policy: &Policy,
-        log: LogSettings,
-    ) -> anyhow::Result<Self> {
-        let recorder = match &arguments.record {
-            Some(folder) => Some(Recorder::start(folder, arguments.record_episodes, bundle, log.engine)?),
-            None => None,
-        };
-        let logger = match &arguments.log {
-            Some(file) => Some(start_log(file, policy, &log)?),
-            None => None,
-        };
-        let every = arguments.telemetry_every;
-        let snapshots =
-            arguments.telemetry.clone().map(|file| Snapshots::start(SnapshotSettings { file, every }));
-        Ok(Self { recorder, logger, snapshots: snapshots.transpose()? })
+/// All that is made of the records while the run goes on.
+struct Sinks {
+    log: Option<LogWriter>,
+    snapshots: Option<Snapshots>,
+    status: StatusLine,
+}
+
+impl Sink for Sinks {
+    fn wants_pictures(&self) -> bool {
+        self.log.is_some()
     }
 
-    pub(super) fn all(&mut self) -> impl Iterator<Item = &mut dyn TickObserver> {
-        fn observer<T: TickObserver>(one: &mut T) -> &mut dyn TickObserver {
-            one
-        }
-        let Self { recorder, logger, snapshots } = self;
-        let all = [
-            recorder.as_mut().map(observer),
-            logger.as_mut().map(observer),
-            snapshots.as_mut().map(observer),
-        ];
-        all.into_iter().flatten()
+    fn take(&mut self, record: &Record) {
+        self.log.iter_mut().for_each(|log| log.take(record));
+        self.snapshots.iter_mut().for_each(|snapshots| snapshots.take(record));
+        self.status.take(record);
     }
 
-    pub(super) fn frames_dropped(&self) -> u64 {
-        self.recorder.as_ref().map_or(0, Recorder::dropped)
+    fn pause(&mut self, dropped: u64) {
+        self.log.iter_mut().for_each(|log| log.pause(dropped));
+        self.snapshots.iter_mut().for_each(|snapshots| snapshots.pause(dropped));
+    }
+}
+
+/// What records a run.
+pub(super) struct Recording {
+    recorder: Recorder<Sinks>,
+    films: Option<Films>,
+}
+
+/// Films to draw after the run.
+struct Films {
+    folder: PathBuf,
+    episodes: u64,
+    /// Nobody else records there.
+    lock: Lock,
+}
+
+/// What is left of a run.
+pub(super) struct Left {
+    log: Option<LogSummary>,
+    films: Option<Films>,
+    /// What did not fit between robot and policy.
+    pub(super) remarks: Vec<String>,
+}
+
+impl ObserverArguments {
+    /// Opens what is written while the run goes on, and starts the thread that writes.
+    pub(super) fn start(&self, policy: &Policy, log: LogSettings) -> anyhow::Result<Recording> {
+        let films = self.record.as_deref().map(|folder| self.films(folder)).transpose()?;
+        let status =
+            StatusLine::start(&log.instance, policy.manifest()).context("starting the status line")?;
+        let log = match (&self.log, &films) {
+            (Some(file), _) => Some(start_log(file, policy, &log)?),
+            (None, Some(films)) => {
+                let log = LogSettings { episodes_max: Some(films.episodes), ..log };
+                Some(start_log(&films.folder.join(LOG_FOR_FILMS), policy, &log)?)
+            }
+            (None, None) => None,
+        };
+        let every = self.telemetry_every;
+        let snapshots = self.telemetry.clone().map(|file| Snapshots::start(SnapshotSettings { file, every }));
+        let sinks = Sinks { log, snapshots: snapshots.transpose()?, status };
+        Ok(Recording { recorder: Recorder::start(policy, sinks)?, films })
+    }
+
+    fn films(&self, folder: &Path) -> anyhow::Result<Films> {
+        std::fs::create_dir_all(folder).with_context(|| format!("--record {}", folder.display()))?;
+        let lock = Lock::take(folder).context("--record")?;
+        Ok(Films { folder: folder.to_path_buf(), episodes: self.record_episodes, lock })
+    }
+}
+
+impl Recording {
+    /// What the loop shows its ticks to.
+    pub(super) fn recorder(&mut self) -> &mut impl TickObserver {
+        &mut self.recorder
     }
 
     /// Waits until everything is written. What could not be written keeps nothing else from being told.
-    pub(super) fn finish(self) -> (Left, Vec<anyhow::Error>) {
-        let writes = self.recorder.is_some() || self.logger.is_some() || self.snapshots.is_some();
-        // Where nothing is left to write, a terminal is not waited for either.
-        let bar = writes.then(|| {
-            let bar = indicatif::ProgressBar::new_spinner().with_message("writing what was recorded");
-            bar.enable_steady_tick(Duration::from_millis(200));
-            bar
-        });
-        let mut failures = Vec::new();
-        let log = self.logger.and_then(|logger| note(logger.finish(), &mut failures));
+    pub(super) fn finish(self, failures: &mut Vec<anyhow::Error>) -> Left {
+        let Some(Finished { sink, dropped }) = note(self.recorder.finish(), failures) else {
+            return Left { log: None, films: None, remarks: Vec::new() };
+        };
+        let remarks = sink.status.finish();
+        let log = sink.log.and_then(|log| note(log.finish(dropped), failures));
         // A log of nothing would only take the name from the next run's.
-        let empty = log.as_ref().filter(|log| log.ticks == 0 && log.dropped == 0);
-        if let Some(LogSummary { file, .. }) = empty {
-            let removed = std::fs::remove_file(file)
+        let (log, empty): (Vec<_>, Vec<_>) =
+            log.into_iter().partition(|log| log.ticks > 0 || log.dropped > 0);
+        for LogSummary { file, .. } in empty {
+            let removed = std::fs::remove_file(&file)
                 .with_context(|| format!("removing the empty log {}", file.display()));
-            note(removed, &mut failures);
+            note(removed, failures);
         }
-        let log = log.filter(|log| log.ticks > 0 || log.dropped > 0);
-        self.snapshots.and_then(|snapshots| note(snapshots.finish(), &mut failures));
-        let recorded = self.recorder.and_then(|recorder| note(recorder.finish(), &mut failures));
-        bar.inspect(indicatif::ProgressBar::finish_and_clear);
-        (Left { log, recorded: recorded.unwrap_or_default() }, failures)
+        sink.snapshots.and_then(|snapshots| note(snapshots.finish(dropped), failures));
+        Left { log: log.into_iter().next(), films: self.films, remarks }
     }
 }
 
@@ -195,24 +224,33 @@ pub(super) fn note<T, E: Into<anyhow::Error>>(
 }
 
 impl Left {
+    /// Ticks that are missing in the log.
+    pub(super) fn dropped(&self) -> u64 {
+        self.log.as_ref().map_or(0, |log| log.dropped)
+    }
+
     /// One line for people of each thing that was written.
     pub(super) fn lines(&self) -> String {
-        let Recorded { films, episodes, broken_episodes } = &self.recorded;
-        let mut text = String::new();
-        for path in films.iter().chain(episodes) {
-            text += &format!("recorded   {}\n", path.display());
-        }
-        if *broken_episodes > 0 {
-            text += &format!(
-                "recorded   {broken_episodes} episode(s) without .npz: observations of them were lost\n"
-            );
-        }
-        if let Some(LogSummary { file, ticks, dropped, bytes }) = &self.log {
-            let mib = *bytes as f64 / f64::from(1 << 20);
-            text +=
-                &format!("logged     {}: {ticks} ticks, {dropped} dropped, {mib:.1} MiB\n", file.display());
-        }
-        text
+        let Some(LogSummary { file, ticks, dropped, bytes, .. }) = &self.log else { return String::new() };
+        let mib = *bytes as f64 / f64::from(1 << 20);
+        format!("logged     {}: {ticks} ticks, {dropped} dropped, {mib:.1} MiB\n", file.display())
+    }
+
+    /// Draws the films that were asked for.
+    pub(super) fn draw_films(self) -> anyhow::Result<()> {
+        let (Some(log), Some(Films { folder, episodes, lock })) = (self.log, self.films) else {
+            return Ok(());
+        };
+        // It takes the lock itself.
+        drop(lock);
+        let arguments = |lab: &mut Command| {
+            lab.args(["film", "--episodes", &episodes.to_string(), "--log"]).arg(&log.file);
+            log.bundles.iter().for_each(|bundle| _ = lab.arg("--bundle").arg(bundle));
+            lab.arg("--out").arg(&folder);
+        };
+        lab::run("drawing films", arguments).with_context(|| {
+            format!("the films were not drawn; `rcwm-lab film --log {}` tries again", log.file.display())
+        })
     }
 }
 
@@ -224,18 +262,30 @@ impl ObserverArguments {
         report: &RunReport,
     ) -> anyhow::Result<String> {
         let RunReport { preset, bundle_task, engine, counters, pace, .. } = report;
+        let LatencyFiles { hgrm, plot } = &self.latency_files;
         if counters.observations == 0 {
             return Ok(String::new());
         }
-        let period_us = match pace {
-            Some(Pace::Realtime { rate_hz }) => Some(1e6 / rate_hz),
-            _ => None,
-        };
-        let title = format!(
-            "{preset} bundle for {bundle_task}, engine {engine}: {} observations",
-            counters.observations
-        );
-        self.latency_files.write(telemetry, &title, period_us)?;
+        if let Some(folder) = hgrm {
+            telemetry.write_hgrm(folder)?;
+        }
+        if let Some(file) = plot {
+            let folder = tempfile::tempdir().context("--plot")?;
+            telemetry.write_hgrm(folder.path())?;
+            let observations = counters.observations;
+            let title =
+                format!("{preset} bundle for {bundle_task}, engine {engine}: {observations} observations");
+            lab::run("drawing", |lab| {
+                lab.args(["plot", "--quiet", "--title", &title, "--hgrm"])
+                    .arg(folder.path())
+                    .arg("--out")
+                    .arg(file);
+                if let Some(Pace::Realtime { rate_hz }) = pace {
+                    lab.args(["--period-us", &(1e6 / rate_hz).to_string()]);
+                }
+            })
+            .context("--plot")?;
+        }
         Ok(self.latency_files.lines())
     }
 }

@@ -1,9 +1,11 @@
 //! What does not fit between robot and policy, and is nobody's error: another rate, another task, a clock that is not kept.
 
+use rcwm_models::bundle::Manifest;
 use rcwm_models::tasks::{OWN_TASK, task_name};
 use rcwm_models::wire::Observation;
 
-use crate::controller::{Counters, Tick};
+use crate::controller::Counters;
+use crate::record::Record;
 
 /// Rates that differ by less are the same.
 const RATE_TOLERANCE: f64 = 0.01;
@@ -19,7 +21,6 @@ const LATE_SHARE: u64 = 10;
 pub(super) struct Remarks {
     made: Vec<String>,
     told: usize,
-    policy: Option<u64>,
     task: Option<u32>,
     period_ns: u64,
     slow_told: bool,
@@ -35,16 +36,15 @@ struct Paced {
 }
 
 impl Remarks {
-    /// What is new with this tick. Allocates only where there is something to say.
-    pub(super) fn of(&mut self, tick: &Tick<'_>) -> &[String] {
-        if let Some(observation) = tick.observation {
-            let manifest = tick.policy.manifest();
-            if self.policy.replace(tick.policy.number()) != Some(tick.policy.number()) {
-                (self.task, self.period_ns) = (None, 0);
-            }
-            self.look(observation, &manifest.task, manifest.control.rate_hz);
+    /// What is new with this tick of a policy of this manifest.
+    pub(super) fn of(&mut self, record: &Record, manifest: &Manifest) -> &[String] {
+        if record.exchanged.is_some() {
+            (self.task, self.period_ns) = (None, 0);
         }
-        self.lateness(tick.counters);
+        if record.observed {
+            self.look(&record.observation, &manifest.task, manifest.control.rate_hz);
+        }
+        self.lateness(&record.counters);
         let new = self.told;
         self.told = self.made.len();
         &self.made[new..]

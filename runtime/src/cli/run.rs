@@ -5,15 +5,14 @@ use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, Ordering};
 use std::time::Duration;
 
-use anyhow::Context;
 use clap::Args;
 use rcwm_models::bundle::Bundle;
 use rcwm_models::wire::{LinkSettings, say_closed_for};
 
-use super::observers::{ObserverArguments, Observers, note};
+use super::observers::{ObserverArguments, note};
 use super::safety::{SafetyArguments, TimeArguments};
-use super::status::StatusLine;
-use crate::controller::{Controller, ControllerError, ControllerSettings, Ended, TickObserver};
+use super::shared;
+use crate::controller::{Controller, ControllerSettings, Ended};
 use crate::engine::{EngineKind, EngineSettings};
 use crate::log::LogSettings;
 use crate::policy::{Policy, Sampling};
@@ -80,7 +79,7 @@ pub(super) fn run(arguments: &RunArguments) -> anyhow::Result<()> {
     let link = LinkSettings::new(&arguments.instance);
     // Before and after, the robot may be another controller's.
     let is_ours = Arc::new(AtomicBool::new(false));
-    let stop = super::stop_flag_after({
+    let stop = shared::stop_flag_after({
         let is_ours = Arc::clone(&is_ours);
         move || {
             if is_ours.load(Ordering::Relaxed) {
@@ -89,7 +88,7 @@ pub(super) fn run(arguments: &RunArguments) -> anyhow::Result<()> {
             }
         }
     })?;
-    let bundle = super::open_bundle(&arguments.bundle)?;
+    let bundle = shared::open_bundle(&arguments.bundle)?;
     let engine = EngineSettings::chosen(arguments.engine, arguments.threads, arguments.half_weights)?;
     let sampling = match arguments.sample {
         true => Sampling::Sample { seed: arguments.seed },
@@ -102,7 +101,7 @@ pub(super) fn run(arguments: &RunArguments) -> anyhow::Result<()> {
         rate_max: settings.rate_max,
         ..LogSettings::new(&arguments.instance, engine, sampling)
     };
-    let mut observers = Observers::start(&arguments.observers, &bundle, &policy, log)?;
+    let mut recording = arguments.observers.start(&policy, log)?;
     let mut controller = Controller::open(policy, settings)?;
     is_ours.store(true, Ordering::Relaxed);
     match arguments.swapper(&bundle, engine, sampling) {
@@ -110,7 +109,6 @@ pub(super) fn run(arguments: &RunArguments) -> anyhow::Result<()> {
         // A run without swaps is better than none.
         Err(reason) => rcwm_models::errln!("warning: this run takes no swaps: {reason}"),
     }
-    let mut status = StatusLine::start(&arguments.instance).context("starting the status line")?;
     // Asked for last: the other threads stay ordinary ones.
     let granted = match arguments.time.ask() {
         Ok(granted) => granted,
@@ -120,30 +118,28 @@ pub(super) fn run(arguments: &RunArguments) -> anyhow::Result<()> {
             return Err(error);
         }
     };
-    let result = control(&mut controller, &mut status, &mut observers, &stop);
+    let result = controller.run(&stop, &mut [recording.recorder()]);
     // The robot has been told: what follows may take its time, or wait for a terminal.
     let closed = controller.close();
-    let remarks = status.finish();
     let ended = result.as_ref().map_or_else(Ended::from, |ended| *ended);
     let mut report = controller.report(arguments.engine, ended);
     report.realtime = granted;
-    report.remarks = remarks;
     let telemetry = controller.telemetry().clone();
     is_ours.store(false, Ordering::Relaxed);
     drop(controller);
-    report.frames_dropped = observers.frames_dropped();
-    let (left, unwritten) = observers.finish();
     // How the run ended comes first: it decides the exit code.
     let mut failures = Vec::new();
     let ran = note(result, &mut failures).is_some();
-    failures.extend(unwritten);
+    let left = recording.finish(&mut failures);
+    (report.frames_dropped, report.remarks) = (left.dropped(), left.remarks.clone());
     if report.counters.observations > 0 || ran {
-        note(super::write_json(arguments.json.as_deref(), &report), &mut failures);
+        note(shared::write_json(arguments.json.as_deref(), &report), &mut failures);
         rcwm_models::out!("{}", report.summary());
     }
     rcwm_models::out!("{}", left.lines());
     let written = note(arguments.observers.write_latencies(&telemetry, &report), &mut failures);
     rcwm_models::out!("{}", written.unwrap_or_default());
+    note(left.draw_films(), &mut failures);
     note(closed, &mut failures);
     let mut failures = failures.into_iter();
     let first = failures.next();
@@ -160,11 +156,6 @@ impl RunArguments {
         engine: EngineSettings,
         sampling: Sampling,
     ) -> Result<Swapper, String> {
-        if self.observers.records() {
-            return Err(
-                "with --record, films are drawn by the decoder of the bundle it was started with".into()
-            );
-        }
         let (link, rate_hz) = (LinkSettings::new(&self.instance), bundle.manifest.control.rate_hz);
         Swapper::start(SwapSettings { link, engine, sampling, rate_hz }).map_err(|error| error.to_string())
     }
@@ -177,15 +168,4 @@ impl RunArguments {
             ..self.safety.settings(&self.instance, &self.time)
         }
     }
-}
-
-fn control(
-    controller: &mut Controller,
-    status: &mut StatusLine,
-    observers: &mut Observers,
-    stop: &AtomicBool,
-) -> Result<Ended, ControllerError> {
-    let mut all: Vec<&mut dyn TickObserver> = vec![status];
-    all.extend(observers.all());
-    controller.run(stop, &mut all)
 }

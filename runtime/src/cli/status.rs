@@ -1,14 +1,15 @@
-//! The live line of `run`: drawn by its own thread, so that a slow terminal never holds up a tick.
+//! The live line of `run`: drawn by a thread of its own, so that a slow terminal holds up neither a tick nor a log.
 
 use std::sync::mpsc::{Receiver, SyncSender, sync_channel};
 use std::thread::JoinHandle;
 use std::time::{Duration, Instant};
 
+use rcwm_models::bundle::Manifest;
 use rcwm_models::terminal::LINE_EVERY;
 
 use super::remarks::Remarks;
-use crate::controller::{Tick, TickObserver};
-use crate::telemetry::Stage;
+use crate::record::{Record, Sink};
+use crate::telemetry::{Stage, Telemetry};
 
 /// Time between two updates of the line.
 const UPDATE: Duration = Duration::from_millis(200);
@@ -22,19 +23,20 @@ enum Message {
     Line(String),
 }
 
-/// The loop's end of the live line.
+/// The live line, made from the records.
 pub(super) struct StatusLine {
     messages: Option<SyncSender<Message>>,
     thread: Option<JoinHandle<()>>,
     last: Instant,
     last_observations: u64,
-    reported: u64,
     clock_ahead: bool,
+    latencies: Telemetry,
+    manifest: Manifest,
     remarks: Remarks,
 }
 
 impl StatusLine {
-    pub(super) fn start(waiting_for: &str) -> std::io::Result<Self> {
+    pub(super) fn start(waiting_for: &str, manifest: &Manifest) -> std::io::Result<Self> {
         let (messages, received) = sync_channel(WAITING_MAX);
         let waiting = format!("waiting for an observation on instance {waiting_for:?}");
         let thread =
@@ -44,8 +46,9 @@ impl StatusLine {
             thread: Some(thread),
             last: Instant::now(),
             last_observations: 0,
-            reported: 0,
             clock_ahead: false,
+            latencies: Telemetry::new(),
+            manifest: manifest.clone(),
             remarks: Remarks::default(),
         })
     }
@@ -62,47 +65,53 @@ impl StatusLine {
         }
     }
 
-    fn status(&mut self, tick: &Tick<'_>) -> String {
+    fn status(&self, record: &Record) -> String {
         let elapsed_s = self.last.elapsed().as_secs_f64();
-        let rate_hz = (tick.counters.observations - self.last_observations) as f64 / elapsed_s;
-        let latency = tick.telemetry.latency(Stage::EndToEnd);
-        let running = tick.running;
+        let rate_hz = (record.counters.observations - self.last_observations) as f64 / elapsed_s;
+        let latency = self.latencies.latency(Stage::EndToEnd);
+        let Record { running, whole: [whole, solved], .. } = record;
         format!(
-            "episode {} step {} return {:.1}{} | {} done, {} solved | p50 {:.0} us p99 {:.0} us | {rate_hz:.1} Hz",
+            "episode {} step {} return {:.1}{} | {whole} done, {solved} solved | p50 {:.0} us p99 {:.0} us | {rate_hz:.1} Hz",
             running.episode,
             running.steps,
             running.return_sum,
             if running.success { " success" } else { "" },
-            tick.episodes.whole(),
-            tick.episodes.successes(),
             latency.p50_us,
             latency.p99_us,
         )
     }
 }
 
-impl TickObserver for StatusLine {
-    fn ticked(&mut self, tick: &Tick<'_>) {
-        for episode in tick.episodes.since(self.reported) {
+impl Sink for StatusLine {
+    fn wants_pictures(&self) -> bool {
+        false
+    }
+
+    fn take(&mut self, record: &Record) {
+        for (stage, time_ns) in &record.recordings {
+            self.latencies.record(*stage, *time_ns);
+        }
+        for episode in &record.ended {
             self.send(Message::Line(episode.line()));
         }
-        self.reported = tick.episodes.ended();
-        if tick.counters.clock_ahead > 0 && !std::mem::replace(&mut self.clock_ahead, true) {
+        if record.counters.clock_ahead > 0 && !std::mem::replace(&mut self.clock_ahead, true) {
             let said = "the robot's clock is ahead of this machine's CLOCK_MONOTONIC: its times are taken as those of receiving";
             self.send(Message::Line(said.into()));
         }
-        let Self { remarks, messages, .. } = self;
-        for remark in remarks.of(tick) {
-            // If the drawing thread is gone or held up there is nothing to draw on.
-            let _ =
-                messages.as_ref().map(|messages| messages.try_send(Message::Line(format!("note: {remark}"))));
+        if let Some(policy) = &record.exchanged {
+            self.manifest.clone_from(&policy.manifest);
         }
+        let new: Vec<_> =
+            self.remarks.of(record, &self.manifest).iter().map(|text| format!("note: {text}")).collect();
+        new.into_iter().for_each(|line| self.send(Message::Line(line)));
         if self.last.elapsed() >= UPDATE {
-            let status = self.status(tick);
+            let status = self.status(record);
             self.send(Message::Status(status));
-            (self.last, self.last_observations) = (Instant::now(), tick.counters.observations);
+            (self.last, self.last_observations) = (Instant::now(), record.counters.observations);
         }
     }
+
+    fn pause(&mut self, _: u64) {}
 }
 
 impl Drop for StatusLine {

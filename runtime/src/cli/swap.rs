@@ -7,6 +7,7 @@ use clap::Args;
 use rcwm_models::wire::LinkSettings;
 use serde::Serialize;
 
+use super::shared;
 use crate::swap::{Answer, When, ask};
 
 /// Arguments of `swap`.
@@ -50,8 +51,8 @@ struct Report<'a> {
 }
 
 pub(super) fn run(arguments: &SwapArguments) -> anyhow::Result<()> {
-    super::prepare_json(arguments.json.as_deref())?;
-    let stop = super::stop_flag()?;
+    shared::prepare_json(arguments.json.as_deref())?;
+    let stop = shared::stop_flag()?;
     let SwapArguments { instance, bundle, now, timeout, json } = arguments;
     let when = if *now { When::Now } else { When::Episode };
     let timeout = (*timeout > 0.0).then(|| Duration::from_secs_f64(*timeout));
@@ -70,7 +71,7 @@ pub(super) fn run(arguments: &SwapArguments) -> anyhow::Result<()> {
     bar.finish_and_clear();
     let total_s = start.elapsed().as_secs_f64();
     let report = Report { instance, bundle, when, answer: &answer, prepared_s: ready_s, total_s };
-    super::write_json(json.as_deref(), &report)?;
+    shared::write_json(json.as_deref(), &report)?;
     match answer {
         Answer::Taken { task, preset, updates, .. } => {
             rcwm_models::outln!(

@@ -5,7 +5,7 @@ use std::path::PathBuf;
 use clap::Args;
 use serde::Serialize;
 
-use super::EngineChoice;
+use super::shared::{self, EngineChoice};
 use crate::engine::EngineSettings;
 use crate::verify::{EngineReport, HalfReport, half_weights, verify, work_units};
 
@@ -43,10 +43,10 @@ struct Report<'a> {
 }
 
 pub(super) fn run(arguments: &VerifyArguments) -> anyhow::Result<()> {
-    super::prepare_json(arguments.json.as_deref())?;
-    let bundle = super::open_bundle(&arguments.bundle)?;
+    shared::prepare_json(arguments.json.as_deref())?;
+    let bundle = shared::open_bundle(&arguments.bundle)?;
     let (kinds, left_out) = arguments.engine.engines()?;
-    let bar = super::progress_bar(work_units(&bundle)? * kinds.len(), "verifying", "parts and ticks");
+    let bar = shared::progress_bar(work_units(&bundle)? * kinds.len(), "verifying", "parts and ticks");
     let mut engines = Vec::new();
     for kind in kinds {
         // As a run deploys it.
@@ -67,7 +67,7 @@ pub(super) fn run(arguments: &VerifyArguments) -> anyhow::Result<()> {
         half_weights,
         engines: &engines,
     };
-    super::write_json(arguments.json.as_deref(), &report)?;
+    shared::write_json(arguments.json.as_deref(), &report)?;
     for engine in &engines {
         rcwm_models::out!("{}", engine.text());
     }

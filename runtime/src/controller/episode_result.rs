@@ -39,7 +39,8 @@ impl EpisodeResult {
         }
     }
 
-    pub(super) fn add(&mut self, observation: &Observation) {
+    /// Counts an observation.
+    pub fn add(&mut self, observation: &Observation) {
         self.steps = observation.step;
         self.success |= observation.is(ObservationFlags::SUCCESS);
         if observation.reward.is_finite() {

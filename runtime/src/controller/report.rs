@@ -143,7 +143,7 @@ pub struct RunReport {
     pub realtime: Option<Granted>,
     /// What does not fit between robot and policy, for people.
     pub remarks: Vec<String>,
-    /// Frames that were not recorded because the recorder could not keep up.
+    /// Ticks that are missing in the log because the writer could not keep up.
     pub frames_dropped: u64,
     /// Percentiles per stage.
     pub latency: Vec<Latency>,
@@ -280,7 +280,10 @@ impl RunReport {
             text += &format!("swaps      {} policies taken over while running\n", c.swaps);
         }
         if self.frames_dropped > 0 {
-            text += &format!("recording  {} frames dropped\n", self.frames_dropped);
+            text += &format!(
+                "recording  {} ticks are missing in the log: the writer could not keep up\n",
+                self.frames_dropped
+            );
         }
         text
     }

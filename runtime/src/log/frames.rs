@@ -5,12 +5,12 @@ use std::io::{self, Read, Write};
 use super::record::VERSION;
 
 /// The first bytes of a log.
-pub(super) const MAGIC: [u8; 8] = *b"rcwm-log";
+pub const MAGIC: [u8; 8] = *b"rcwm-log";
 /// Largest payload accepted, in bytes: a hundred times what a tick takes.
 const PAYLOAD_BYTES_MAX: usize = 1 << 20;
 
 /// What comes next in a file.
-pub(super) enum Next<'a> {
+pub enum Next<'a> {
     /// A whole frame.
     Payload(&'a [u8]),
     /// The file ends here, between two frames.
@@ -19,13 +19,14 @@ pub(super) enum Next<'a> {
     Damaged(String),
 }
 
-pub(super) fn write_start(to: &mut impl Write) -> io::Result<()> {
+/// Writes what every log begins with.
+pub fn write_start(to: &mut impl Write) -> io::Result<()> {
     to.write_all(&MAGIC)?;
     to.write_all(&VERSION.to_le_bytes())
 }
 
 /// Gives the frame's bytes.
-pub(super) fn write_frame(to: &mut impl Write, payload: &[u8]) -> io::Result<u64> {
+pub fn write_frame(to: &mut impl Write, payload: &[u8]) -> io::Result<u64> {
     let len = u32::try_from(payload.len()).map_err(io::Error::other)?;
     to.write_all(&len.to_le_bytes())?;
     to.write_all(&crc32c::crc32c(payload).to_le_bytes())?;
@@ -34,20 +35,21 @@ pub(super) fn write_frame(to: &mut impl Write, payload: &[u8]) -> io::Result<u64
 }
 
 /// Reads frame after frame.
-pub(super) struct FrameReader<R> {
+pub struct FrameReader<R> {
     from: R,
     payload: Vec<u8>,
     /// Where the next frame begins, in bytes.
-    pub(super) offset: u64,
+    pub offset: u64,
 }
 
 impl<R: Read> FrameReader<R> {
     /// `offset` is how many bytes were read before.
-    pub(super) fn new(from: R, offset: u64) -> Self {
+    pub fn new(from: R, offset: u64) -> Self {
         Self { from, payload: Vec::new(), offset }
     }
 
-    pub(super) fn next(&mut self) -> io::Result<Next<'_>> {
+    /// The next frame.
+    pub fn read(&mut self) -> io::Result<Next<'_>> {
         let mut head = [0; 8];
         match read_up_to(&mut self.from, &mut head)? {
             0 => return Ok(Next::End),
@@ -77,7 +79,7 @@ impl<R: Read> FrameReader<R> {
 }
 
 /// Reads until `to` is full or the file ends.
-pub(super) fn read_up_to(from: &mut impl Read, to: &mut [u8]) -> io::Result<usize> {
+pub fn read_up_to(from: &mut impl Read, to: &mut [u8]) -> io::Result<usize> {
     let mut filled = 0;
     while filled < to.len() {
         match from.read(&mut to[filled..]) {

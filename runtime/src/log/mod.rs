@@ -5,48 +5,30 @@
 //! numbers are little-endian. The first payload is the [`Header`] as JSON, every other one a [`Record`] in postcard's encoding, the
 //! last one [`Record::End`]. Pictures are packed without loss: the difference to the last one, in LZ4.
 //!
-//! **Writing.** The loop copies a tick into a buffer of a fixed pool; packing and writing happen in another thread. In lock-step
-//! an empty pool makes the loop wait, in real time the tick is dropped, counted, and marked in the next record.
+//! **Writing.** [`LogWriter`] is a sink of [`crate::record`]: packing and writing happen in the writer's thread. Ticks that were dropped
+//! are marked in the next record.
 //!
 //! **Damage.** A log that was cut or changed is read up to the damage, which is one clear error.
 //!
 //! **Where a replay may start.** Every record holds a digest of the state; the first one, one of every [`KEYFRAME_TICKS`], and each one
 //! after dropped ticks holds the whole state and the place of the random generator.
 
-mod episodes;
-mod frames;
-mod latencies;
-mod logger;
-mod pack;
+pub mod frames;
+pub mod pack;
 mod reader;
 mod record;
-mod replay;
-mod report;
-mod slot;
-#[cfg(test)]
-#[allow(clippy::unwrap_used, reason = "a test that fails panics")]
-mod tests;
-mod worker;
+mod writer;
 
-pub use episodes::{WrittenEpisodes, write_episodes};
-pub use latencies::{LoggedLatencies, LoggedLatencyReport};
-pub use logger::{LogSettings, Logger};
 pub use reader::{Entry, LogReader, LoggedTick};
 pub use record::{
-    BundleIdentity, Header, KEYFRAME_TICKS, LoggedCall, LoggedOutcome, Machine, Record, TickRecord,
+    Answer, BundleIdentity, DIGEST_BYTES, Header, KEYFRAME_TICKS, LoggedCall, LoggedOutcome, Machine,
+    Observed, Record, TickRecord, WholeState, digest,
 };
-pub use replay::Replayer;
-pub use report::{Answers, Difference, ReplayReport};
-pub use worker::LogSummary;
+pub use writer::{LogSettings, LogSummary, LogWriter};
 
 use std::path::PathBuf;
 
-use rcwm_models::bundle::BundleError;
-use rcwm_models::episode::EpisodeError;
-
-use crate::policy::PolicyError;
-
-/// Why a log could not be written, read or replayed.
+/// Why a log could not be written or read.
 #[derive(Debug, thiserror::Error)]
 pub enum LogError {
     /// The file could not be opened, read or written.
@@ -95,26 +77,4 @@ pub enum LogError {
         /// Ticks read before it.
         ticks: u64,
     },
-    /// The writing thread could not be started, or has panicked.
-    #[error("log: {0}")]
-    Thread(String),
-    /// The log was made with a bundle that is not at hand.
-    #[error(
-        "the log was made with another bundle than {tried}: {difference}; name that bundle with --bundle"
-    )]
-    OtherBundle {
-        /// The folders that were tried.
-        tried: String,
-        /// What differs.
-        difference: String,
-    },
-    /// A bundle was refused.
-    #[error(transparent)]
-    Bundle(#[from] BundleError),
-    /// The policy could not be loaded.
-    #[error(transparent)]
-    Policy(#[from] PolicyError),
-    /// An episode could not be written.
-    #[error(transparent)]
-    Episode(#[from] EpisodeError),
 }

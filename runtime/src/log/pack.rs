@@ -22,7 +22,7 @@ pub struct PackedMask {
 
 impl PackedMask {
     /// A pixel of more than one half is the robot.
-    pub(super) fn pack(mask: &[u8; MASK_BYTES]) -> Self {
+    pub fn pack(mask: &[u8; MASK_BYTES]) -> Self {
         let mut bits = [0; MASK_BITS_BYTES];
         for (byte, pixels) in bits.iter_mut().zip(mask.chunks_exact(8)) {
             *byte = pixels.iter().fold(0, |byte, pixel| byte << 1 | u8::from(*pixel > 127));
@@ -30,7 +30,8 @@ impl PackedMask {
         Self { lz4: lz4_flex::block::compress(&bits) }
     }
 
-    pub(super) fn unpack(&self, mask: &mut [u8; MASK_BYTES]) -> Result<(), String> {
+    /// The mask, of 0 and 255.
+    pub fn unpack(&self, mask: &mut [u8; MASK_BYTES]) -> Result<(), String> {
         let mut bits = [0; MASK_BITS_BYTES];
         unpack(&self.lz4, &mut bits)?;
         for (pixels, byte) in mask.chunks_exact_mut(8).zip(bits) {
@@ -43,20 +44,23 @@ impl PackedMask {
 }
 
 /// Packs or unpacks one picture after another.
-pub(super) struct ImagePacker {
+pub struct ImagePacker {
     last: Box<[u8; IMAGE_BYTES]>,
     difference: Box<[u8; IMAGE_BYTES]>,
     has_last: bool,
 }
 
-impl ImagePacker {
-    pub(super) fn new() -> Self {
+impl Default for ImagePacker {
+    /// Before the first picture.
+    fn default() -> Self {
         let zeros = || Box::new([0; IMAGE_BYTES]);
         Self { last: zeros(), difference: zeros(), has_last: false }
     }
+}
 
+impl ImagePacker {
     /// `whole` makes a picture that can be unpacked without those before it.
-    pub(super) fn pack(&mut self, image: &[u8; IMAGE_BYTES], whole: bool) -> PackedImage {
+    pub fn pack(&mut self, image: &[u8; IMAGE_BYTES], whole: bool) -> PackedImage {
         let delta = self.has_last && !whole;
         let lz4 = if delta {
             self.difference.copy_from_slice(image);
@@ -70,11 +74,8 @@ impl ImagePacker {
         PackedImage { delta, lz4 }
     }
 
-    pub(super) fn unpack(
-        &mut self,
-        packed: &PackedImage,
-        image: &mut [u8; IMAGE_BYTES],
-    ) -> Result<(), String> {
+    /// The picture; those before it must have been unpacked, unless it is a whole one.
+    pub fn unpack(&mut self, packed: &PackedImage, image: &mut [u8; IMAGE_BYTES]) -> Result<(), String> {
         if packed.delta && !self.has_last {
             return Err("a difference to a picture that is not there".into());
         }
@@ -115,7 +116,7 @@ mod tests {
 
     #[test]
     fn pictures_come_back_bit_for_bit_and_small() {
-        let (mut packer, mut unpacker) = (ImagePacker::new(), ImagePacker::new());
+        let (mut packer, mut unpacker) = (ImagePacker::default(), ImagePacker::default());
         for step in 0..40 {
             let packed = packer.pack(&image(step), step % 16 == 0);
             assert_eq!(packed.delta, step % 16 != 0);
@@ -128,12 +129,12 @@ mod tests {
 
     #[test]
     fn a_difference_to_nothing_and_a_short_picture_are_refused() {
-        let (mut packer, mut found) = (ImagePacker::new(), [0; IMAGE_BYTES]);
+        let (mut packer, mut found) = (ImagePacker::default(), [0; IMAGE_BYTES]);
         packer.pack(&image(0), false);
         let delta = packer.pack(&image(1), false);
-        assert!(ImagePacker::new().unpack(&delta, &mut found).is_err());
+        assert!(ImagePacker::default().unpack(&delta, &mut found).is_err());
         let short = PackedImage { delta: false, lz4: lz4_flex::block::compress(&[0; 100]) };
-        assert!(ImagePacker::new().unpack(&short, &mut found).unwrap_err().contains("100 bytes"));
+        assert!(ImagePacker::default().unpack(&short, &mut found).unwrap_err().contains("100 bytes"));
     }
 
     #[test]

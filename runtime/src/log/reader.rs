@@ -65,7 +65,7 @@ impl LogReader {
             return Err(LogError::Version { path: path.to_path_buf(), found: version, expected: VERSION });
         }
         let mut frames = FrameReader::new(file, MAGIC.len() as u64 + 4);
-        let header: Header = match frames.next().map_err(io)? {
+        let header: Header = match frames.read().map_err(io)? {
             Next::Payload(payload) => {
                 serde_json::from_slice(payload).map_err(|error| no_log(error.to_string()))?
             }
@@ -76,7 +76,7 @@ impl LogReader {
             return Err(no_log(format!("its header tells of {unfit}")));
         }
         let path = path.to_path_buf();
-        let images = ImagePacker::new();
+        let images = ImagePacker::default();
         Ok(Self { path, header, frames, images, ticks: 0, bytes, finished: false, over: false })
     }
 
@@ -121,7 +121,7 @@ impl LogReader {
     fn read_entry(&mut self, offset: u64) -> Result<Option<Entry>, LogError> {
         let (path, ticks) = (self.path.clone(), self.ticks);
         let damaged = |reason: String| LogError::Damaged { path: path.clone(), offset, reason, ticks };
-        let next = self.frames.next().map_err(|source| LogError::Io { path: path.clone(), source })?;
+        let next = self.frames.read().map_err(|source| LogError::Io { path: path.clone(), source })?;
         let payload = match next {
             Next::Payload(payload) => payload,
             Next::End => return Ok(None),

@@ -13,13 +13,13 @@ use crate::engine::EngineSettings;
 use crate::policy::{BranchState, CallKind, Sampling, State, Surprise};
 
 /// Version of the file.
-pub(super) const VERSION: u32 = 1;
+pub const VERSION: u32 = 1;
 /// One record of so many holds the whole state and a whole picture.
 pub const KEYFRAME_TICKS: u64 = 256;
 /// Most threads that a run may have.
 const THREADS_MAX: usize = 64;
 /// Bytes of a state's digest.
-pub(super) const DIGEST_BYTES: usize = 16;
+pub const DIGEST_BYTES: usize = 16;
 
 /// What the run was made with.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
@@ -48,7 +48,7 @@ pub struct Header {
 
 impl Header {
     /// What in it no run could have written; a checksum only says that nothing was changed since.
-    pub(super) fn unfit(&self) -> Option<String> {
+    pub fn unfit(&self) -> Option<String> {
         if !(1..=THREADS_MAX).contains(&self.engine.threads) {
             return Some(format!(
                 "an engine with {} threads, expected 1 to {THREADS_MAX}",
@@ -209,7 +209,9 @@ pub struct Observed {
 }
 
 impl Observed {
-    pub(super) fn of(observation: &Observation, image: PackedImage, mask: Option<PackedMask>) -> Self {
+    /// Of an observation with its packed picture and mask.
+    #[must_use]
+    pub fn of(observation: &Observation, image: PackedImage, mask: Option<PackedMask>) -> Self {
         let o = observation;
         Self {
             sequence: o.sequence,
@@ -229,7 +231,7 @@ impl Observed {
     }
 
     /// The observation but for picture and mask, which are zeros.
-    pub(super) fn without_picture(&self) -> Observation {
+    pub fn without_picture(&self) -> Observation {
         Observation {
             sequence: self.sequence,
             episode: self.episode,
@@ -311,7 +313,9 @@ pub struct WholeState {
 }
 
 impl WholeState {
-    pub(super) fn of(state: &State, noise_position: u128) -> Self {
+    /// Of the policy's state, and where its random generator stands.
+    #[must_use]
+    pub fn of(state: &State, noise_position: u128) -> Self {
         Self {
             robot_z: state.robot.z.clone(),
             robot_h: state.robot.h.clone(),
@@ -334,7 +338,7 @@ impl WholeState {
 }
 
 /// The first half of the sha256 over the bits of z and h of both branches.
-pub(super) fn digest(state: &State) -> [u8; DIGEST_BYTES] {
+pub fn digest(state: &State) -> [u8; DIGEST_BYTES] {
     let mut hash = Sha256::new();
     for branch in [&state.robot, &state.environment] {
         branch.z.iter().for_each(|class| hash.update(class.to_le_bytes()));

@@ -5,6 +5,7 @@
 
 mod branches;
 mod pieces;
+mod places;
 
 use std::sync::Arc;
 use std::time::Duration;
@@ -17,11 +18,12 @@ use super::parts::finite;
 use super::stages::StageClock;
 use super::tick::{Tick, Work};
 use super::{Buffers, PolicyError};
-use crate::compile::{CompileError, Optimizations, compile, inputs};
+use crate::compile::{CompileError, Optimizations, compile};
 use crate::engine::{EngineError, weights};
 use crate::operators::SharedTeam;
 use branches::Branches;
 use pieces::{Piece, Values};
+use places::Places;
 use rcwm_kernels::team::Team;
 
 /// How long the helper looks for work after the last before it sleeps.
@@ -30,6 +32,7 @@ const HELPER_SPINS: Duration = Duration::from_micros(200);
 /// A bundle's tick, ready to run.
 pub(super) struct Compiled {
     values: Values,
+    places: Places,
     /// Early, in the order they run.
     early: Vec<Piece>,
     encoder: Piece,
@@ -37,10 +40,6 @@ pub(super) struct Compiled {
     actor: Piece,
     team: Option<SharedTeam>,
 }
-
-const BRANCHES: [PartName; 2] = [PartName::Robot, PartName::Environment];
-/// Outputs of a branch that must be known before the image is.
-const PRIOR: [usize; 3] = [H_NEXT, PRIOR_Z, PRIOR_LOG_PROBS];
 
 impl Compiled {
     pub(super) fn load(
@@ -66,14 +65,7 @@ impl Compiled {
             let piece = Piece::load(&segment, &mut values, team.as_ref().filter(|_| shares))?;
             if segment.late { late.push(piece) } else { early.push(piece) }
         }
-        for branch in BRANCHES {
-            for name in PRIOR.map(|output| output_name(branch, output)) {
-                if !early.iter().any(|piece| piece.makes(&values, name)) {
-                    let reason = format!("{name} depends on the image; a prior must not");
-                    return Err(CompileError::Part { part: branch, reason }.into());
-                }
-            }
-        }
+        let places = Places::of(&values, &early)?;
         let mut late = |part: PartName| {
             let found =
                 late.iter().position(|piece: &Piece| piece.part == part).map(|index| late.remove(index));
@@ -82,17 +74,17 @@ impl Compiled {
         };
         let (encoder, actor) = (late(PartName::Encoder)?, late(PartName::Actor)?);
         let branches = Branches::new(late(PartName::Robot)?, late(PartName::Environment)?, team.as_ref())?;
-        Ok(Self { values, early, encoder, branches, actor, team })
+        Ok(Self { values, places, early, encoder, branches, actor, team })
     }
 
     /// The actor on the state that is there.
     fn act(&mut self, work: &mut Work<'_>) -> Result<(), PolicyError> {
-        let Self { actor, values, team, .. } = self;
+        let Self { actor, values, places, team, .. } = self;
         let Work { buffers, clock, .. } = work;
         let mut run = || {
             actor.run(values)?;
-            values.copy("actor/mean", &mut buffers.mean)?;
-            values.copy("actor/std", &mut buffers.std)
+            values.copy(places.mean, &mut buffers.mean)?;
+            values.copy(places.std, &mut buffers.std)
         };
         run().map_err(|error| run_error(PartName::Actor, &error))?;
         clock.ended(PartName::Actor);
@@ -104,41 +96,42 @@ impl Compiled {
 
     /// The tick's inputs but the image.
     fn fill(&mut self, action: &[f32; ACTION_LEN], work: &Work<'_>) -> TractResult<()> {
-        let (values, Work { state, noise, .. }) = (&mut self.values, work);
-        values.fill(inputs::ACTION, action.as_slice())?;
-        values.fill(inputs::ROBOT_Z, &state.robot.z)?;
-        values.fill(inputs::ROBOT_H, &state.robot.h)?;
-        values.fill(inputs::ROBOT_NOISE, noise.robot())?;
-        values.fill(inputs::ENVIRONMENT_Z, &state.environment.z)?;
-        values.fill(inputs::ENVIRONMENT_H, &state.environment.h)?;
-        values.fill(inputs::ENVIRONMENT_NOISE, noise.environment())
+        let (Self { values, places, .. }, Work { state, noise, .. }) = (self, work);
+        let Places { robot, environment, .. } = places;
+        values.fill(places.action, action.as_slice())?;
+        values.fill(robot.z, &state.robot.z)?;
+        values.fill(robot.h, &state.robot.h)?;
+        values.fill(robot.noise, noise.robot())?;
+        values.fill(environment.z, &state.environment.z)?;
+        values.fill(environment.h, &state.environment.h)?;
+        values.fill(environment.noise, noise.environment())
     }
 
     /// What the early pieces have made.
     fn copy_priors(&self, buffers: &mut Buffers) -> Result<(), PolicyError> {
-        let values = &self.values;
-        for (part, branch) in buffers.branches() {
+        let Self { values, places, .. } = self;
+        for ((part, branch), at) in buffers.branches().into_iter().zip(places.branches()) {
             let mut copy = || {
-                values.copy(output_name(part, H_NEXT), &mut branch.h_next)?;
-                values.copy(output_name(part, PRIOR_Z), &mut branch.prior_z)?;
-                values.copy(output_name(part, PRIOR_LOG_PROBS), &mut branch.prior_log_probs)
+                values.copy(at.h_next, &mut branch.h_next)?;
+                values.copy(at.prior_z, &mut branch.prior_z)?;
+                values.copy(at.prior_log_probs, &mut branch.prior_log_probs)
             };
             copy().map_err(|error| run_error(part, &error))?;
         }
         let mut copy = || {
-            values.copy("interaction/e", &mut buffers.e)?;
-            values.copy("interaction/attention", &mut buffers.attention)
+            values.copy(places.e, &mut buffers.e)?;
+            values.copy(places.attention, &mut buffers.attention)
         };
         copy().map_err(|error| run_error(PartName::Interaction, &error))
     }
 
     /// What the branches have made of the image.
     fn copy_posteriors(&self, buffers: &mut Buffers) -> Result<(), PolicyError> {
-        let values = &self.values;
-        for (part, branch) in buffers.branches() {
+        let Self { values, places, .. } = self;
+        for ((part, branch), at) in buffers.branches().into_iter().zip(places.branches()) {
             let mut copy = || {
-                values.copy(output_name(part, POSTERIOR_Z), &mut branch.posterior_z)?;
-                values.copy(output_name(part, POSTERIOR_LOG_PROBS), &mut branch.posterior_log_probs)
+                values.copy(at.posterior_z, &mut branch.posterior_z)?;
+                values.copy(at.posterior_log_probs, &mut branch.posterior_log_probs)
             };
             copy().map_err(|error| run_error(part, &error))?;
         }
@@ -169,8 +162,8 @@ impl Tick for Compiled {
     }
 
     fn observe(&mut self, image: &[u8], work: &mut Work<'_>) -> Result<(), PolicyError> {
-        let Self { values, encoder, .. } = self;
-        let encoded = values.fill(inputs::IMAGE, image).and_then(|()| encoder.run(values));
+        let Self { values, places, encoder, .. } = self;
+        let encoded = values.fill(places.image, image).and_then(|()| encoder.run(values));
         encoded.map_err(|error| run_error(PartName::Encoder, &error))?;
         work.clock.ended(PartName::Encoder);
         self.branches.run(&mut self.values, work.clock).map_err(|(part, error)| run_error(part, &error))?;
@@ -180,8 +173,8 @@ impl Tick for Compiled {
     }
 
     fn imagine(&mut self, work: &mut Work<'_>) -> Result<(), PolicyError> {
-        for part in BRANCHES {
-            self.values.alias(output_name(part, PRIOR_Z), output_name(part, POSTERIOR_Z));
+        for at in self.places.branches() {
+            self.values.alias(at.prior_z, at.posterior_z);
         }
         work.buffers.believe_prior();
         self.act(work)
@@ -201,34 +194,5 @@ impl Tick for Compiled {
         if let Some(team) = &self.team {
             team.wake();
         }
-    }
-}
-
-// Outputs of a branch, as places in the list below.
-const H_NEXT: usize = 0;
-const PRIOR_Z: usize = 1;
-const PRIOR_LOG_PROBS: usize = 2;
-const POSTERIOR_Z: usize = 3;
-const POSTERIOR_LOG_PROBS: usize = 4;
-
-/// Name of an output of a branch in the whole tick. Spelled out, so that none is put together while a tick runs.
-const fn output_name(part: PartName, output: usize) -> &'static str {
-    const ROBOT: [&str; 5] = [
-        "robot/h_next",
-        "robot/prior_z",
-        "robot/prior_log_probs",
-        "robot/posterior_z",
-        "robot/posterior_log_probs",
-    ];
-    const ENVIRONMENT: [&str; 5] = [
-        "environment/h_next",
-        "environment/prior_z",
-        "environment/prior_log_probs",
-        "environment/posterior_z",
-        "environment/posterior_log_probs",
-    ];
-    match part {
-        PartName::Robot => ROBOT[output],
-        _ => ENVIRONMENT[output],
     }
 }

@@ -30,7 +30,7 @@ pub use noise::Sampling;
 pub use parts::{BranchBuffers, Buffers};
 pub use state::{BranchState, State};
 
-use std::path::Path;
+use std::path::{Path, PathBuf};
 use std::time::Instant;
 
 use rcwm_models::bundle::{Bundle, Manifest, PartName};
@@ -85,6 +85,7 @@ enum Before {
 
 /// A policy that carries its state from tick to tick.
 pub struct Policy {
+    folder: PathBuf,
     manifest: Manifest,
     limits: ActionLimits,
     tick: Box<dyn Tick>,
@@ -120,6 +121,7 @@ impl Policy {
             state: initial.clone(),
             initial,
             noise: NoiseSource::new(sampling, model),
+            folder: bundle.folder.clone(),
             manifest: bundle.manifest.clone(),
             ahead: None,
             calls: CallRing::new(),
@@ -159,34 +161,16 @@ impl Policy {
         image: &[u8],
         executed_action: Option<&[f32; ACTION_LEN]>,
     ) -> Result<Decision, PolicyError> {
-        let result = self.observe_unnoted(image, executed_action);
-        self.calls.note(CallKind::Observe, executed_action, (&result).into());
-        result
-    }
-
-    fn observe_unnoted(
-        &mut self,
-        image: &[u8],
-        executed_action: Option<&[f32; ACTION_LEN]>,
-    ) -> Result<Decision, PolicyError> {
-        if image.len() != IMAGE_BYTES {
-            let found = image.len();
-            return Err(PolicyError::Observation(format!(
-                "the image has {found} bytes, expected {IMAGE_BYTES}"
-            )));
-        }
-        let before = Self::before(executed_action)?;
-        if before == Before::Start {
-            self.reset();
-        }
-        let mut clock = StageClock::start();
-        let recomputed = self.prepare(before, &mut clock)?;
-        // From here on the buffers hold a tick that may fail half-way.
-        self.ahead = None;
-        let (tick, mut work) = self.work(&mut clock);
-        tick.observe(image, &mut work)?;
-        let surprise = Some(self.buffers.surprise());
-        self.decide(&clock, surprise, recomputed)
+        let before = match image.len() {
+            IMAGE_BYTES => self.before(executed_action),
+            found => {
+                Err(PolicyError::Observation(format!("the image has {found} bytes, expected {IMAGE_BYTES}")))
+            }
+        };
+        self.decide(CallKind::Observe, executed_action, before, |tick, work| {
+            tick.observe(image, work)?;
+            Ok(Some(work.buffers.surprise()))
+        })
     }
 
     /// Computes all of the next tick that needs only the action before it (robot prior, interaction, environment's recurrence),
@@ -197,18 +181,11 @@ impl Policy {
     /// As [`Self::observe`].
     pub fn work_ahead(&mut self, action: Option<&[f32; ACTION_LEN]>) -> Result<(), PolicyError> {
         let start = Instant::now();
-        let result = self.work_ahead_unnoted(action);
+        let result =
+            self.before(action).and_then(|before| self.prepare(before, &mut StageClock::start()).map(drop));
         let outcome = CallOutcome::of_work_ahead(&result, start.elapsed().as_nanos() as u64);
         self.calls.note(CallKind::WorkAhead, action, outcome);
         result
-    }
-
-    fn work_ahead_unnoted(&mut self, action: Option<&[f32; ACTION_LEN]>) -> Result<(), PolicyError> {
-        let before = Self::before(action)?;
-        if before == Before::Start {
-            self.reset();
-        }
-        self.prepare(before, &mut StageClock::start()).map(drop)
     }
 
     /// Gets ready for an image that will come soon: since the last one others have used the caches, so what stands between image and
@@ -229,24 +206,19 @@ impl Policy {
     /// # Errors
     /// As [`Self::observe`].
     pub fn imagine(&mut self, executed_action: &[f32; ACTION_LEN]) -> Result<Decision, PolicyError> {
-        let result = self.imagine_unnoted(executed_action);
-        self.calls.note(CallKind::Imagine, Some(executed_action), (&result).into());
-        result
+        let before = self.before(Some(executed_action));
+        self.decide(CallKind::Imagine, Some(executed_action), before, |tick, work| {
+            tick.imagine(work).map(|()| None)
+        })
     }
 
-    fn imagine_unnoted(&mut self, executed_action: &[f32; ACTION_LEN]) -> Result<Decision, PolicyError> {
-        let before = Self::before(Some(executed_action))?;
-        let mut clock = StageClock::start();
-        let recomputed = self.prepare(before, &mut clock)?;
-        self.ahead = None;
-        let (tick, mut work) = self.work(&mut clock);
-        tick.imagine(&mut work)?;
-        self.decide(&clock, None, recomputed)
-    }
-
-    fn before(action: Option<&[f32; ACTION_LEN]>) -> Result<Before, PolicyError> {
+    /// What stands before the tick; an episode's start goes back to the learned initial state.
+    fn before(&mut self, action: Option<&[f32; ACTION_LEN]>) -> Result<Before, PolicyError> {
         match action {
-            None => Ok(Before::Start),
+            None => {
+                self.reset();
+                Ok(Before::Start)
+            }
             Some(action) if action.iter().all(|x| x.is_finite()) => Ok(Before::Action(*action)),
             Some(action) => {
                 Err(PolicyError::Observation(format!("executed action {action:?} is not finite")))
@@ -279,14 +251,31 @@ impl Policy {
         (tick.as_mut(), Work { state, noise, buffers, clock })
     }
 
-    /// The action of the tick that is in the buffers, whose state is carried on.
+    /// A decision by `tick`, which gives the surprise; the call is noted, however it ends.
     fn decide(
         &mut self,
-        clock: &StageClock,
-        surprise: Option<Surprise>,
-        recomputed: bool,
+        kind: CallKind,
+        executed_action: Option<&[f32; ACTION_LEN]>,
+        before: Result<Before, PolicyError>,
+        tick: impl FnOnce(&mut dyn Tick, &mut Work<'_>) -> Result<Option<Surprise>, PolicyError>,
     ) -> Result<Decision, PolicyError> {
-        let StageClock { spent_ns: stage_ns, helper_late, .. } = *clock;
+        let result = before.and_then(|before| self.try_decide(before, tick));
+        self.calls.note(kind, executed_action, (&result).into());
+        result
+    }
+
+    fn try_decide(
+        &mut self,
+        before: Before,
+        tick: impl FnOnce(&mut dyn Tick, &mut Work<'_>) -> Result<Option<Surprise>, PolicyError>,
+    ) -> Result<Decision, PolicyError> {
+        let mut clock = StageClock::start();
+        let recomputed = self.prepare(before, &mut clock)?;
+        // From here on the buffers hold a tick that may fail half-way.
+        self.ahead = None;
+        let (of_engine, mut work) = self.work(&mut clock);
+        let surprise = tick(of_engine, &mut work)?;
+        let StageClock { spent_ns: stage_ns, helper_late, .. } = clock;
         let (mean, std) = (self.buffers.mean, self.buffers.std);
         let action = self.noise.action(&mean, &std);
         // A sample of two finite numbers can be too large for one: no limit makes that an action.
@@ -342,6 +331,12 @@ impl Policy {
     pub fn set_noise(&mut self, robot: &[f32], environment: &[f32]) -> Result<(), PolicyError> {
         self.ahead = None;
         self.noise.set(robot, environment)
+    }
+
+    /// The bundle's folder.
+    #[must_use]
+    pub fn folder(&self) -> &Path {
+        &self.folder
     }
 
     /// A number that no other policy of this process has.

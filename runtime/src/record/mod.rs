@@ -1,210 +1,147 @@
-//! Films, strips and episodes of what the policy saw.
+//! One record a tick, from the loop to the one thread that writes.
 //!
-//! The loop only copies a tick into a bounded queue after its action was sent; decoding, drawing and writing happen in another
-//! thread. In lock-step a full queue makes the loop wait, in real time the tick is dropped and counted.
-//!
-//! A folder that holds episodes already is gone on with: numbers follow the largest there.
-//!
-//! | file | holds |
-//! | --- | --- |
-//! | `episode-0003.gif` | what the policy saw; with a decoder also what it made of it, branch by branch |
-//! | `episode-0003.png` | ten moments of it side by side |
-//! | `episode-0003.npz` | the episode in Dreamer's form, if no observation of it was lost |
+//! The loop copies a tick into a buffer of a fixed pool after its action was sent, and allocates nothing. Everything else, the log, the
+//! snapshots, the live line, is made from the records by **sinks** in one other thread, which looks for records every [`LOOK`], so that
+//! the loop need not wake it. In lock-step an empty pool makes the loop wait; in real time the tick is dropped, counted, and told in the
+//! next record.
 
-mod canvas;
-mod film;
-mod panels;
-mod worker;
+#[expect(clippy::module_inception, reason = "the module is called as what it hands over")]
+mod record;
 
-use std::path::{Path, PathBuf};
+pub use record::{Record, RunningPolicy};
+
 use std::sync::Arc;
 use std::sync::atomic::{AtomicU64, Ordering};
-use std::sync::mpsc::{SyncSender, TrySendError, sync_channel};
+use std::sync::mpsc::{Receiver, SyncSender, TryRecvError, sync_channel};
 use std::thread::JoinHandle;
-
-use rcwm_models::bundle::{Bundle, PartName};
-use rcwm_models::episode::EpisodeError;
-use rcwm_models::files::FileError;
-use rcwm_models::lock::{Lock, LockError};
-use rcwm_models::wire::{Action, Observation};
+use std::time::{Duration, Instant};
 
 use crate::controller::{Tick, TickObserver};
-use crate::engine::{self, EngineError, EngineSettings};
-use crate::policy::State;
-use worker::Worker;
+use crate::policy::Policy;
+use record::Progress;
 
-/// Ticks that may wait for the recorder: a few episodes, about 20 MB.
-const QUEUE_TICKS: usize = 1024;
+/// How often the writer looks for records.
+const LOOK: Duration = Duration::from_millis(20);
+/// Niceness of the writer, as of all that must not take the processor from the loop: Linux keeps one per thread.
+const NICENESS: i32 = 10;
 
-/// Why something could not be recorded.
-#[derive(Debug, thiserror::Error)]
-pub enum RecordError {
-    /// The folder could not be made, or a file not written.
-    #[error("recording: {0}")]
-    File(#[from] FileError),
-    /// Another run records there.
-    #[error("recording: {0}")]
-    Lock(#[from] LockError),
-    /// The folder could not be made.
-    #[error("recording: {path}: {source}")]
-    Folder {
-        /// The folder.
-        path: PathBuf,
-        /// What the operating system said.
-        source: std::io::Error,
-    },
-    /// The film could not be written.
-    #[error("recording: {path}: {reason}")]
-    Film {
-        /// The file.
-        path: PathBuf,
-        /// What is wrong.
-        reason: String,
-    },
-    /// A picture is wider than its format allows.
-    #[error("recording: a picture of {pixels} pixels is too wide for a film")]
-    TooWide {
-        /// Its side before enlarging.
-        pixels: usize,
-    },
-    /// The strip could not be written.
-    #[error("recording: {path}: {reason}")]
-    Strip {
-        /// The file.
-        path: PathBuf,
-        /// What is wrong.
-        reason: String,
-    },
-    /// The episode could not be written.
-    #[error("recording: {0}")]
-    Episode(#[from] EpisodeError),
-    /// The decoder failed.
-    #[error("recording: {0}")]
-    Engine(#[from] EngineError),
-    /// The thread could not be started, or has panicked.
-    #[error("recording: {0}")]
-    Thread(String),
+/// Makes something of the records, in the writer's thread. What goes wrong is kept and told after the run: a sink that has failed takes
+/// what comes and does nothing.
+pub trait Sink: Send + 'static {
+    /// Whether it looks at pictures and masks; without, they are not copied.
+    fn wants_pictures(&self) -> bool;
+
+    /// Takes a record; those of a run in their order.
+    fn take(&mut self, record: &Record);
+
+    /// Every 20 ms or so; `dropped` ticks so far have no record.
+    fn pause(&mut self, dropped: u64);
 }
 
-/// A tick on its way to the recorder.
-struct Frame {
-    observation: Observation,
-    state: State,
-    answer: Action,
-    is_first: bool,
-    return_sum: f64,
-    success: bool,
-}
-
-/// What was recorded.
-#[derive(Debug, Clone, PartialEq, Eq, Default)]
-pub struct Recorded {
-    /// Films written.
-    pub films: Vec<PathBuf>,
-    /// Episodes written.
-    pub episodes: Vec<PathBuf>,
-    /// Episodes not written because observations of them were lost.
-    pub broken_episodes: u64,
-}
-
-/// The loop's end of a recorder.
-pub struct Recorder {
-    queue: Option<SyncSender<Box<Frame>>>,
-    thread: Option<JoinHandle<Result<Recorded, RecordError>>>,
-    /// Nobody else records there.
-    _lock: Lock,
+/// Hands a record of every tick to a sink.
+pub struct Recorder<S> {
+    full: Option<SyncSender<Box<Record>>>,
+    free: Receiver<Box<Record>>,
+    thread: Option<JoinHandle<S>>,
     dropped: Arc<AtomicU64>,
-    episodes_left: u64,
+    progress: Progress,
+    pictures: bool,
 }
 
-impl Recorder {
-    /// Starts recording the first `episodes_max` episodes into a folder, which is made where it is missing.
-    pub fn start(
-        folder: &Path,
-        episodes_max: u64,
-        bundle: &Bundle,
-        engine: EngineSettings,
-    ) -> Result<Self, RecordError> {
-        std::fs::create_dir_all(folder)
-            .map_err(|source| RecordError::Folder { path: folder.to_path_buf(), source })?;
-        let lock = Lock::take(folder)?;
-        let decoder = match bundle.part(PartName::Decoder) {
-            Some(_) => Some(engine::load(bundle, PartName::Decoder, engine)?),
-            None => None,
-        };
-        let worker = Worker::new(folder, decoder, bundle.manifest.control.rate_hz);
-        let (queue, frames) = sync_channel(QUEUE_TICKS);
+/// What a recorder leaves behind.
+#[derive(Debug)]
+pub struct Finished<S> {
+    /// The sink.
+    pub sink: S,
+    /// Ticks that have no record.
+    pub dropped: u64,
+}
+
+/// The writer has panicked, or could not be started.
+#[derive(Debug, thiserror::Error)]
+#[error("the thread that writes what is recorded {0}")]
+pub struct WriterLost(String);
+
+impl<S: Sink> Recorder<S> {
+    /// Records that may wait for the writer: half a second at 1 kHz, about 9 MB.
+    pub const RECORDS: usize = 512;
+
+    /// Starts the writer.
+    pub fn start(policy: &Policy, sink: S) -> Result<Self, WriterLost> {
+        Self::with_records(policy, sink, Self::RECORDS)
+    }
+
+    /// The same with another number of records that may wait.
+    pub fn with_records(policy: &Policy, sink: S, records: usize) -> Result<Self, WriterLost> {
+        let records = records.max(1);
+        let (full, filled) = sync_channel(records);
+        let (give_back, free) = sync_channel(records);
+        for _ in 0..records {
+            // Both ends are here and there is room for all of them.
+            let _ = give_back.try_send(Box::new(Record::new(policy)));
+        }
+        let (dropped, pictures) = (Arc::new(AtomicU64::new(0)), sink.wants_pictures());
+        let dropped_so_far = Arc::clone(&dropped);
         let thread = std::thread::Builder::new()
-            .name("recorder".into())
-            .spawn(move || worker.run(&frames))
-            .map_err(|error| RecordError::Thread(error.to_string()))?;
-        Ok(Self {
-            queue: Some(queue),
-            thread: Some(thread),
-            _lock: lock,
-            dropped: Arc::default(),
-            episodes_left: episodes_max,
-        })
+            .name("writer".into())
+            .spawn(move || write(sink, &filled, &give_back, &dropped_so_far))
+            .map_err(|error| WriterLost(format!("could not be started: {error}")))?;
+        let (full, thread, progress) = (Some(full), Some(thread), Progress::of(policy));
+        Ok(Self { full, free, thread, dropped, progress, pictures })
     }
 
-    /// Ticks dropped so far.
-    #[must_use]
-    pub fn dropped(&self) -> u64 {
-        self.dropped.load(Ordering::Relaxed)
-    }
-
-    /// Waits until everything is written.
-    ///
-    /// # Errors
-    /// The first error of the recording thread.
-    pub fn finish(mut self) -> Result<Recorded, RecordError> {
-        self.queue = None;
+    /// Waits until the sink has taken all records.
+    pub fn finish(mut self) -> Result<Finished<S>, WriterLost> {
+        self.full = None;
+        let dropped = self.dropped.load(Ordering::Relaxed);
         match self.thread.take().map(JoinHandle::join) {
-            Some(Ok(result)) => result,
-            Some(Err(_)) => Err(RecordError::Thread("the recording thread panicked".into())),
-            None => Ok(Recorded::default()),
-        }
-    }
-
-    fn send(&mut self, frame: Box<Frame>) {
-        let Some(queue) = &self.queue else { return };
-        let lockstep = frame.observation.period_ns == 0;
-        let sent = if lockstep {
-            queue.send(frame).map_err(|_| true)
-        } else {
-            queue.try_send(frame).map_err(|error| matches!(error, TrySendError::Disconnected(_)))
-        };
-        match sent {
-            Ok(()) => {}
-            // The thread has ended with an error, which `finish` will report.
-            Err(true) => self.queue = None,
-            Err(false) => {
-                self.dropped.fetch_add(1, Ordering::Relaxed);
-            }
+            Some(Ok(sink)) => Ok(Finished { sink, dropped }),
+            Some(Err(_)) | None => Err(WriterLost("panicked; this is a bug of this program".into())),
         }
     }
 }
 
-impl TickObserver for Recorder {
+impl<S: Sink> TickObserver for Recorder<S> {
     fn ticked(&mut self, tick: &Tick<'_>) {
-        // A tick without an observation has nothing to show.
-        let Some(observation) = tick.observation else { return };
-        if tick.is_first {
-            if self.episodes_left == 0 {
-                self.queue = None;
-            }
-            self.episodes_left = self.episodes_left.saturating_sub(1);
-        }
-        if self.queue.is_none() {
+        let Some(full) = &self.full else { return };
+        let lockstep = tick.observation.is_some_and(|observation| observation.period_ns == 0);
+        let free = if lockstep { self.free.recv().ok() } else { self.free.try_recv().ok() };
+        let Some(mut record) = free else {
+            self.progress.dropped += 1;
+            self.dropped.fetch_add(1, Ordering::Relaxed);
             return;
+        };
+        record.fill(&mut self.progress, tick, self.pictures);
+        if full.send(record).is_err() {
+            // The writer has panicked, which `finish` will report.
+            self.full = None;
         }
-        self.send(Box::new(Frame {
-            observation: *observation,
-            state: tick.policy.state().clone(),
-            answer: tick.answer,
-            is_first: tick.is_first,
-            return_sum: tick.running.return_sum,
-            success: tick.running.success,
-        }));
+    }
+}
+
+fn write<S: Sink>(
+    mut sink: S,
+    filled: &Receiver<Box<Record>>,
+    give_back: &SyncSender<Box<Record>>,
+    dropped: &AtomicU64,
+) -> S {
+    // Where that is not granted, it is written as fast as may be.
+    let _ = rustix::process::setpriority_process(Some(rustix::thread::gettid()), NICENESS);
+    let mut paused = Instant::now();
+    loop {
+        let next = filled.try_recv();
+        if paused.elapsed() >= LOOK {
+            sink.pause(dropped.load(Ordering::Relaxed));
+            paused = Instant::now();
+        }
+        match next {
+            Ok(record) => {
+                sink.take(&record);
+                // The loop may have ended; then nobody needs it back.
+                let _ = give_back.try_send(record);
+            }
+            Err(TryRecvError::Empty) => std::thread::sleep(LOOK),
+            Err(TryRecvError::Disconnected) => return sink,
+        }
     }
 }

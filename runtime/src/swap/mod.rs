@@ -106,7 +106,7 @@ pub enum SwapError {
     /// Nobody answers.
     #[error(
         "no run on instance {instance:?} takes swaps: {source}; start `rcwm-runtime run --instance {instance}` (same machine, \
-         same RCWM_PREFIX, without --record)"
+         same RCWM_PREFIX)"
     )]
     NoServer {
         /// The instance.

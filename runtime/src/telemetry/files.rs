@@ -5,8 +5,6 @@ use std::path::PathBuf;
 use clap::Args;
 use rcwm_models::files::{FileError, Output, prepare_output};
 
-use super::{Curve, PlotError, Stage, Telemetry, plot};
-
 /// The options of every verb that measures latencies.
 #[derive(Debug, Clone, Default, Args)]
 pub struct LatencyFiles {
@@ -29,25 +27,6 @@ impl LatencyFiles {
                 .map_err(|source| FileError::Io { path: folder.clone(), source })?;
         }
         self.plot.as_deref().map_or(Ok(()), |file| prepare_output(file, Output::Png))
-    }
-
-    /// Writes what was asked for; `period_us` is a line in the plot.
-    pub fn write(&self, telemetry: &Telemetry, title: &str, period_us: Option<f64>) -> Result<(), PlotError> {
-        if let Some(folder) = &self.hgrm {
-            telemetry.write_hgrm(folder)?;
-        }
-        if let Some(file) = &self.plot {
-            let curves: Vec<_> = Stage::ALL
-                .into_iter()
-                .filter(|stage| !telemetry.histogram(*stage).is_empty())
-                .map(|stage| Curve {
-                    label: stage.as_str().replace('_', " "),
-                    histogram: telemetry.histogram(stage),
-                })
-                .collect();
-            plot(file, title, &curves, period_us)?;
-        }
-        Ok(())
     }
 
     /// One line for people of each thing that was written.

@@ -1,4 +1,4 @@
-//! Latency histograms, one per stage; files and plots of them at the end of a run.
+//! Latency histograms, one per stage, and files of them at the end of a run.
 //!
 //! Times are kept in nanoseconds with three significant digits up to one minute, so that a recording never allocates and never
 //! fails; they are reported in microseconds.
@@ -6,16 +6,13 @@
 //! | file | holds |
 //! | --- | --- |
 //! | `hgrm` | HdrHistogram's percentile files, for the usual plotters |
-//! | `plot` | latency by percentile as a picture |
 //! | `files` | the options that ask for them |
 
 mod files;
 mod hgrm;
-mod plot;
 mod recent;
 
 pub use files::LatencyFiles;
-pub use plot::{Curve, PlotError, plot};
 pub use recent::RECENT_MAX;
 
 use hdrhistogram::Histogram;

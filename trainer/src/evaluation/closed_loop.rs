@@ -8,13 +8,14 @@ use std::time::{Duration, Instant};
 
 use rcwm_models::episode::{Episode, EpisodeError};
 use rcwm_models::files::{FileError, read_capped};
+use rcwm_models::programs::Program;
 use rcwm_models::wire::{LinkError, LinkSettings, ObserverLink, Wait, forget_prefix};
 use serde::{Deserialize, Serialize};
 
 use super::statistics::{Interval, mean_and_std, wilson};
 use crate::acting::FleetError;
 use crate::model::parameters::ParameterError;
-use crate::simulators::{LEARNING, ProcessError, Program, RunningProgram};
+use crate::simulators::{LEARNING, ProcessError, RunningProgram};
 use pair::{Domain, Pair, Programs, StepContext, read_json};
 
 /// A simulator or runtime whose other side is gone ends by itself after so many seconds.

@@ -21,4 +21,4 @@ pub use client::{Client, ClientError};
 pub use collect::{CollectSettings, Collected, Progress, Sums, collect, collect_disturbed, record};
 pub use collect_error::CollectError;
 pub use plan::{Amounts, Job, Plan, Script};
-pub use process::{Launch, ProcessError, Program, RunningProgram, SimulatorProcess};
+pub use process::{Launch, ProcessError, RunningProgram, SimulatorProcess};

@@ -1,10 +1,11 @@
 use std::fs::File;
 use std::io::{Read, Seek, SeekFrom};
-use std::path::{Path, PathBuf};
+use std::path::PathBuf;
 use std::process::{Child, Command, ExitStatus, Stdio};
 use std::time::{Duration, Instant};
 
 use rcwm_models::episode::STEPS_MAX;
+use rcwm_models::programs::{MissingProgram, Program};
 use rustix::process::{Pid, Signal, kill_process};
 
 use super::LEARNING;
@@ -18,16 +19,8 @@ const LAST_WORDS_BYTES: u64 = 4096;
 #[derive(Debug, thiserror::Error)]
 pub enum ProcessError {
     /// The program is nowhere.
-    #[error(
-        "{name} was found neither beside this program nor on the PATH; build it (cargo build --release -p {name}), or name it with \
-         the variable {variable}"
-    )]
-    Missing {
-        /// The program's name.
-        name: &'static str,
-        /// The variable that may name its path.
-        variable: &'static str,
-    },
+    #[error(transparent)]
+    Missing(#[from] MissingProgram),
     /// It could not be started.
     #[error("starting {path}: {source}")]
     Start {
@@ -58,44 +51,6 @@ pub enum ProcessError {
         /// What the operating system said.
         source: std::io::Error,
     },
-}
-
-/// A program that comes with this one.
-#[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub struct Program {
-    /// The binary's name.
-    pub name: &'static str,
-    /// The environment variable that may name its path.
-    pub variable: &'static str,
-}
-
-impl Program {
-    /// Meta-World behind shared memory.
-    pub const SIMULATOR: Self = Self { name: "rcwm-simulator", variable: "RCWM_SIMULATOR" };
-    /// The controller that runs an exported bundle.
-    pub const RUNTIME: Self = Self { name: "rcwm-runtime", variable: "RCWM_RUNTIME" };
-
-    /// Its path: what the variable says, else beside this program, else on the PATH.
-    ///
-    /// # Errors
-    /// [`ProcessError::Missing`].
-    pub fn find(self) -> Result<PathBuf, ProcessError> {
-        if let Some(path) = std::env::var_os(self.variable).filter(|path| !path.is_empty()) {
-            return Ok(path.into());
-        }
-        let own = std::env::current_exe().ok();
-        let beside = own.as_deref().and_then(Path::parent).map(Path::to_path_buf);
-        // Tests and examples live one folder below the binaries.
-        let above = beside.as_deref().and_then(Path::parent).map(Path::to_path_buf);
-        let search = std::env::var_os("PATH").unwrap_or_default();
-        beside
-            .into_iter()
-            .chain(above)
-            .chain(std::env::split_paths(&search))
-            .map(|folder| folder.join(self.name))
-            .find(|path| path.is_file())
-            .ok_or(ProcessError::Missing { name: self.name, variable: self.variable })
-    }
 }
 
 /// What a simulator is to run.

@@ -251,7 +251,8 @@ mod tests {
     }
 
     fn show(values: &mut Values, number: f32) {
-        values.fill("image", &[number; LEN]).unwrap();
+        let image = values.find("image");
+        values.fill(image, &[number; LEN]).unwrap();
     }
 
     /// The helper is sent with an image, and done with it.
@@ -269,7 +270,7 @@ mod tests {
             beside.run(&mut values, &mut StageClock::start()).unwrap();
             for output in ["robot", "environment"] {
                 let mut found = [0.0; LEN];
-                values.copy(output, &mut found).unwrap();
+                values.copy(values.find(output).unwrap(), &mut found).unwrap();
                 assert_eq!(found, [-step as f32; LEN], "{output}");
             }
         }

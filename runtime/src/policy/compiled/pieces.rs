@@ -1,6 +1,5 @@
 //! Segments loaded into tract, and the values that go between them without being copied.
 
-use std::collections::BTreeMap;
 use std::sync::Arc;
 
 use rcwm_models::bundle::PartName;
@@ -12,18 +11,27 @@ use super::super::PolicyError;
 use crate::compile::{CompileError, Fact, Segment};
 use crate::operators::{self, SharedTeam};
 
-/// Values by name.
+/// The values of a tick.
 #[derive(Default)]
 pub(super) struct Values {
-    places: BTreeMap<String, usize>,
+    names: Vec<String>,
     tensors: Vec<Arc<Tensor>>,
 }
 
+/// Where a value lies.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub(super) struct Place(usize);
+
 impl Values {
-    /// The place of a value; a new one holds zeros.
-    fn place(&mut self, name: &str, fact: Option<&Fact>) -> TractResult<usize> {
-        if let Some(place) = self.places.get(name) {
-            return Ok(*place);
+    /// The place of a value.
+    pub(super) fn find(&self, name: &str) -> Option<Place> {
+        self.names.iter().position(|known| known == name).map(Place)
+    }
+
+    /// The same; a new one holds zeros.
+    fn place(&mut self, name: &str, fact: Option<&Fact>) -> TractResult<Place> {
+        if let Some(place) = self.find(name) {
+            return Ok(place);
         }
         let tensor = match fact {
             None => Tensor::zero::<f32>(&[0])?,
@@ -34,41 +42,38 @@ impl Values {
             },
         };
         self.tensors.push(Arc::new(tensor));
-        self.places.insert(name.to_owned(), self.tensors.len() - 1);
-        Ok(self.tensors.len() - 1)
+        self.names.push(name.to_owned());
+        Ok(Place(self.tensors.len() - 1))
     }
 
-    /// Writes one of the tick's inputs; one that no segment reads is left out.
-    pub(super) fn fill<T: Datum + Copy>(&mut self, name: &str, from: &[T]) -> TractResult<()> {
-        let Some(place) = self.places.get(name) else { return Ok(()) };
+    /// Writes one of the tick's inputs; one that no segment reads has no place, and is left out.
+    pub(super) fn fill<T: Datum + Copy>(&mut self, place: Option<Place>, from: &[T]) -> TractResult<()> {
+        let Some(Place(place)) = place else { return Ok(()) };
         // A clone happens only if a segment has kept it, which ours do not.
-        let tensor = Arc::make_mut(&mut self.tensors[*place]);
+        let tensor = Arc::make_mut(&mut self.tensors[place]);
         let mut view = tensor.try_as_plain_ram_mut()?;
         let to = view.as_slice_mut::<T>()?;
         if to.len() != from.len() {
-            anyhow::bail!("{name} has {} elements, expected {}", from.len(), to.len());
+            anyhow::bail!("{} has {} elements, expected {}", self.names[place], from.len(), to.len());
         }
         to.copy_from_slice(from);
         Ok(())
     }
 
     /// Reads a value.
-    pub(super) fn copy<T: Datum + Copy>(&self, name: &str, to: &mut [T]) -> TractResult<()> {
-        let Some(place) = self.places.get(name) else { anyhow::bail!("nothing makes {name}") };
-        let view = self.tensors[*place].try_as_plain_ram()?;
+    pub(super) fn copy<T: Datum + Copy>(&self, Place(place): Place, to: &mut [T]) -> TractResult<()> {
+        let view = self.tensors[place].try_as_plain_ram()?;
         let from = view.as_slice::<T>()?;
         if to.len() != from.len() {
-            anyhow::bail!("{name} has {} elements, expected {}", from.len(), to.len());
+            anyhow::bail!("{} has {} elements, expected {}", self.names[place], from.len(), to.len());
         }
         to.copy_from_slice(from);
         Ok(())
     }
 
     /// Makes one value stand for another.
-    pub(super) fn alias(&mut self, of: &str, name: &str) {
-        if let (Some(of), Some(place)) = (self.places.get(of), self.places.get(name)) {
-            self.tensors[*place] = Arc::clone(&self.tensors[*of]);
-        }
+    pub(super) fn alias(&mut self, of: Place, place: Place) {
+        self.tensors[place.0] = Arc::clone(&self.tensors[of.0]);
     }
 }
 
@@ -80,8 +85,8 @@ struct Unwanted;
 /// A segment in tract.
 pub(super) struct Piece {
     pub(super) part: PartName,
-    inputs: Vec<usize>,
-    outputs: Vec<usize>,
+    inputs: Vec<Place>,
+    outputs: Vec<Place>,
     state: TypedSimpleState,
     /// Made beforehand: an error that is made in a tick asks the allocator, and may look at the whole stack.
     unwanted: Option<TractError>,
@@ -121,13 +126,13 @@ impl Piece {
         Ok(Self { part: self.part, inputs, outputs, state, unwanted: Some(Unwanted.into()) })
     }
 
-    pub(super) fn makes(&self, values: &Values, name: &str) -> bool {
-        values.places.get(name).is_some_and(|place| self.outputs.contains(place))
+    pub(super) fn makes(&self, place: Place) -> bool {
+        self.outputs.contains(&place)
     }
 
     /// What goes in.
     pub(super) fn inputs(&self, values: &Values) -> TVec<TValue> {
-        self.inputs.iter().map(|place| Arc::clone(&values.tensors[*place]).into_tvalue()).collect()
+        self.inputs.iter().map(|place| Arc::clone(&values.tensors[place.0]).into_tvalue()).collect()
     }
 
     pub(super) fn run_on(&mut self, inputs: TVec<TValue>) -> TractResult<TVec<TValue>> {
@@ -159,7 +164,7 @@ impl Piece {
     /// Puts what came out where others find it.
     pub(super) fn keep(&self, results: TVec<TValue>, values: &mut Values) {
         for (place, result) in self.outputs.iter().zip(results) {
-            values.tensors[*place] = result.into_arc_tensor();
+            values.tensors[place.0] = result.into_arc_tensor();
         }
     }
 

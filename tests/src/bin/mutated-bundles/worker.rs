@@ -97,7 +97,7 @@ fn use_as_the_runtime_does(folder: &Path) -> (&'static str, String) {
         Ok(bundle) => bundle,
         Err(error) => return ("open", one_line(&error)),
     };
-    if let Err(error) = rcwm_runtime::inspect::inspect(&bundle) {
+    if let Err(error) = rcwm_lab::inspect::inspect(&bundle) {
         return ("inspect", one_line(&error));
     }
     let mut policy = match Policy::new(&bundle, EngineSettings::tract(), Sampling::Sample { seed: 1 }) {

@@ -1,0 +1,18 @@
+//! What is looked at on a desk of what runs on a robot.
+//!
+//! | module | holds |
+//! | --- | --- |
+//! | [`mod@log`] | a logged run again, bit for bit; its times; its episodes |
+//! | [`film`] | films and strips of a logged run |
+//! | [`plot`] | latency by percentile as a picture |
+//! | [`inspect`] | what a bundle holds and what a tick costs |
+//! | [`mod@bench`] | the tick's latency on this machine, engines interleaved |
+//!
+//! This crate never links candle or Python.
+
+pub mod bench;
+pub mod cli;
+pub mod film;
+pub mod inspect;
+pub mod log;
+pub mod plot;

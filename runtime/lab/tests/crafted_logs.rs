@@ -1,0 +1,263 @@
+//! Logs that somebody has made, with checksums that fit: whatever they say, every tool gets through, or says what is wrong.
+
+#![allow(clippy::unwrap_used, reason = "a test that fails panics")]
+
+use std::path::{Path, PathBuf};
+
+use rand::seq::IndexedRandom;
+use rand::{Rng, SeedableRng};
+use rand_chacha::ChaCha8Rng;
+use rcwm_lab::film::film;
+use rcwm_lab::log::{LoggedLatencies, ReplayError, ReplayReport, Replayer, write_episodes};
+use rcwm_lab::plot::{Curve, plot};
+use rcwm_models::bundle::Bundle;
+use rcwm_models::wire::{ActionSource, Observation, ObservationFlags};
+
+use rcwm_runtime::EngineSettings;
+use rcwm_runtime::controller::Fallback;
+use rcwm_runtime::log::frames::{FrameReader, MAGIC, Next, write_frame, write_start};
+use rcwm_runtime::log::pack::{ImagePacker, PackedMask};
+use rcwm_runtime::log::{
+    Answer, BundleIdentity, DIGEST_BYTES, Header, LogError, LogReader, LoggedCall, LoggedOutcome, Machine,
+    Observed, Record, TickRecord, WholeState,
+};
+use rcwm_runtime::policy::{BranchState, CallKind, Policy, STAGES, Sampling, State};
+use rcwm_runtime::telemetry::Stage;
+
+fn bundle() -> PathBuf {
+    Path::new(env!("CARGO_MANIFEST_DIR")).join("../../models/bundles/untrained")
+}
+
+fn header(bundle: &Bundle) -> Header {
+    Header {
+        program: "test".into(),
+        started_unix_s: 0,
+        instance: "test".into(),
+        bundle: BundleIdentity::of(&bundle.manifest),
+        engine: EngineSettings::tract(),
+        sampling: Sampling::Sample { seed: 1 },
+        fallback: Fallback::Hold,
+        rate_max: Some(0.1),
+        stages: Vec::new(),
+        machine: Machine::here(),
+    }
+}
+
+fn state_of(policy: &Policy) -> (State, u128) {
+    (policy.state().clone(), 0)
+}
+
+fn tick(images: &mut ImagePacker, step: u32, state: Option<WholeState>) -> TickRecord {
+    let mut observation = Observation::zeroed();
+    (observation.step, observation.sequence) = (step, u64::from(step));
+    observation.flags = ObservationFlags::default().with(ObservationFlags::FIRST, step == 0).0;
+    observation.image[step as usize] = 200;
+    let image = images.pack(&observation.image, step == 0);
+    let mask = Some(PackedMask::pack(&observation.robot_mask));
+    let action = (step > 0).then_some([0.1; 4]);
+    let (outcome, stage_ns) = ([0.1; 4], vec![1; STAGES.len()]);
+    let decided = LoggedOutcome::Decided { action: outcome, recomputed: false, surprise: None, stage_ns };
+    TickRecord {
+        dropped_before: 0,
+        resumes: state.is_some(),
+        is_first: step == 0,
+        observed: Some(Observed::of(&observation, image, mask)),
+        scheduled_ns: 10,
+        received_ns: 20,
+        overtaken: false,
+        calls: vec![
+            LoggedCall { kind: CallKind::Observe, action, outcome: decided },
+            LoggedCall { kind: CallKind::WorkAhead, action: Some([0.1; 4]), outcome: LoggedOutcome::Done(5) },
+        ],
+        answer: Answer {
+            answers: u64::from(step),
+            published_ns: 30,
+            source: ActionSource::Policy as u32,
+            action: [0.1; 4],
+        },
+        digest: [0; DIGEST_BYTES],
+        state,
+    }
+}
+
+fn payloads(header: &Header, records: &[Record]) -> Vec<Vec<u8>> {
+    let header = serde_json::to_vec(header).unwrap();
+    let records = records.iter().map(|record| postcard::to_allocvec(record).unwrap());
+    std::iter::once(header).chain(records).collect()
+}
+
+fn write(path: &Path, payloads: &[Vec<u8>]) {
+    let mut bytes = Vec::new();
+    write_start(&mut bytes).unwrap();
+    for payload in payloads {
+        write_frame(&mut bytes, payload).unwrap();
+    }
+    std::fs::write(path, bytes).unwrap();
+}
+
+/// Everything that the tools do with a log; the replay's report where it came so far.
+fn use_log(path: &Path) -> Result<ReplayReport, ReplayError> {
+    let mut log = LogReader::open(path)?;
+    let latencies = LoggedLatencies::read(&mut log, &mut |_| true)?;
+    assert!(!latencies.text().is_empty());
+    let folder = tempfile::tempdir().unwrap();
+    // Drawing takes long, and is worth it where times are out of all bounds.
+    if let Some(period_us) = latencies.report.period_us.filter(|period_us| *period_us > 1e12) {
+        let curve = Curve::of("tick", latencies.telemetry.histogram(Stage::Tick));
+        let _ = plot(&folder.path().join("a.png"), "a", &[curve], Some(period_us));
+        film(&mut LogReader::open(path)?, None, folder.path(), 2, &mut |_| true).unwrap();
+    }
+    latencies.telemetry.write_hgrm(folder.path()).unwrap();
+    write_episodes(&mut LogReader::open(path)?, folder.path(), &mut |_| true)?;
+    let mut log = LogReader::open(path)?;
+    let report = Replayer::new(log.header(), &[bundle()], None)?.run(&mut log, &mut |_| true)?;
+    assert!(!report.text().is_empty());
+    Ok(report)
+}
+
+fn of_records(change: impl FnOnce(&mut Header, &mut Vec<TickRecord>)) -> Result<ReplayReport, ReplayError> {
+    let bundle = Bundle::open(&bundle()).unwrap();
+    let mut header = header(&bundle);
+    let mut images = ImagePacker::default();
+    let mut ticks = (0..4).map(|step| tick(&mut images, step, None)).collect();
+    change(&mut header, &mut ticks);
+    let records: Vec<_> = ticks.into_iter().map(|tick| Record::Tick(Box::new(tick))).collect();
+    let folder = tempfile::tempdir().unwrap();
+    let path = folder.path().join("crafted.rcwmlog");
+    write(&path, &payloads(&header, &records));
+    use_log(&path)
+}
+
+#[test]
+fn a_checksum_of_other_letters_is_shown_whole_letters() {
+    for sha256 in ["0123456789aü", "ü", "", "𝄞𝄞𝄞𝄞𝄞𝄞𝄞"] {
+        let error = of_records(|header, _| header.bundle.sha256[0].1 = sha256.into()).unwrap_err();
+        assert!(matches!(error, ReplayError::OtherBundle { .. }), "{error}");
+    }
+}
+
+#[test]
+fn counts_and_times_at_their_limits_are_borne() {
+    let report = of_records(|_, ticks| {
+        for tick in ticks {
+            (tick.dropped_before, tick.scheduled_ns, tick.received_ns) = (u64::MAX, u64::MAX, 0);
+            tick.answer.published_ns = u64::MAX;
+            tick.answer.answers = u64::MAX;
+            tick.calls[1].outcome = LoggedOutcome::Done(u64::MAX);
+            if let LoggedOutcome::Decided { stage_ns, .. } = &mut tick.calls[0].outcome {
+                *stage_ns = vec![u64::MAX; 100];
+            }
+            let observed = tick.observed.as_mut().unwrap();
+            (observed.period_ns, observed.published_ns) = (u64::MAX, u64::MAX);
+            (observed.step, observed.task, observed.flags) = (u32::MAX, u32::MAX, u32::MAX);
+            (observed.sequence, observed.episode, observed.reward) = (u64::MAX, u64::MAX, f32::NAN);
+        }
+    });
+    assert_eq!(report.unwrap().ticks_dropped, u64::MAX);
+}
+
+#[test]
+fn a_state_of_classes_that_do_not_exist_is_a_difference() {
+    let loaded = Policy::load(&bundle(), EngineSettings::tract()).unwrap();
+    let spoilt = |z: Option<i64>, h: Option<f32>| {
+        let (mut state, _) = state_of(&loaded);
+        let BranchState { z: classes, h: values } = &mut state.environment;
+        z.into_iter().for_each(|z| classes[0] = z);
+        h.into_iter().for_each(|h| values[0] = h);
+        WholeState::of(&state, u128::MAX)
+    };
+    let none = (None, None);
+    for (z, h) in
+        [(Some(1_000_000), None), (Some(-1), None), (Some(i64::MAX), None), (None, Some(f32::NAN)), none]
+    {
+        let report = of_records(|_, ticks| {
+            (ticks[1].resumes, ticks[1].state) = (true, Some(spoilt(z, h)));
+        });
+        let first = report.unwrap().first_difference.map(|difference| (difference.tick, difference.what));
+        // The first tick differs in any case: the log was never run.
+        assert!(first.is_some(), "{z:?} {h:?}");
+    }
+}
+
+#[test]
+fn actions_that_are_no_numbers_do_not_reach_the_safety_filter() {
+    for bad in [f32::NAN, f32::INFINITY, f32::NEG_INFINITY] {
+        let report = of_records(|_, ticks| {
+            ticks[1].answer.action = [bad; 4];
+            ticks[2].calls[0].action = Some([bad; 4]);
+            ticks[3].calls[1].action = Some([bad; 4]);
+            ticks[3].calls[0].kind = CallKind::Imagine;
+        });
+        assert!(report.unwrap().ticks_differing > 0);
+    }
+}
+
+#[test]
+fn a_header_that_no_run_has_written_is_said() {
+    for threads in [0, usize::MAX] {
+        let error = of_records(|header, _| header.engine.threads = threads).unwrap_err();
+        assert!(
+            matches!(&error, ReplayError::Log(LogError::NotALog { reason, .. }) if reason.contains("threads")),
+            "{error}"
+        );
+    }
+    let error = of_records(|header, _| header.rate_max = Some(-1.0)).unwrap_err();
+    assert!(
+        matches!(&error, ReplayError::Log(LogError::NotALog { reason, .. }) if reason.contains("rate limit")),
+        "{error}"
+    );
+}
+
+#[test]
+fn a_pipe_is_no_log_and_is_not_waited_for() {
+    let folder = tempfile::tempdir().unwrap();
+    let pipe = folder.path().join("pipe");
+    let mode = rustix::fs::Mode::RUSR | rustix::fs::Mode::WUSR;
+    rustix::fs::mknodat(rustix::fs::CWD, &pipe, rustix::fs::FileType::Fifo, mode, 0).unwrap();
+    for path in [&pipe, folder.path(), Path::new("/dev/zero")] {
+        assert!(matches!(LogReader::open(path), Err(LogError::NotALog { .. })), "{}", path.display());
+    }
+}
+
+#[test]
+fn bytes_changed_at_random_behind_checksums_that_fit_make_no_tool_panic() {
+    let bundle = Bundle::open(&bundle()).unwrap();
+    let mut images = ImagePacker::default();
+    let loaded = Policy::load(&self::bundle(), EngineSettings::tract()).unwrap();
+    let whole = |step| (step % 2 == 0).then(|| WholeState::of(loaded.state(), 7));
+    let mut records: Vec<_> =
+        (0..4).map(|step| Record::Tick(Box::new(tick(&mut images, step, whole(step))))).collect();
+    records.insert(2, Record::Policy(BundleIdentity::of(&bundle.manifest)));
+    records.push(Record::End { ticks: 4, dropped: 0 });
+    let sound = payloads(&header(&bundle), &records);
+    let folder = tempfile::tempdir().unwrap();
+    let path = folder.path().join("crafted.rcwmlog");
+    write(&path, &sound);
+    use_log(&path).unwrap();
+    let mut replayed = 0;
+    for seed in 0..150 {
+        let rng = &mut ChaCha8Rng::seed_from_u64(seed);
+        let mut changed = sound.clone();
+        for _ in 0..rng.random_range(1..4) {
+            let payload = rng.random_range(usize::from(seed % 4 != 0)..changed.len());
+            let payload = &mut changed[payload];
+            let at = rng.random_range(0..payload.len());
+            let value = [0, 1, 0x7f, 0x80, 0xff].choose(rng).copied().unwrap_or(0);
+            let end = (at + rng.random_range(1..12)).min(payload.len());
+            payload[at..end].fill(value);
+        }
+        write(&path, &changed);
+        replayed += u32::from(use_log(&path).is_ok());
+    }
+    assert!(replayed > 15, "{replayed} of 150 came as far as a replay");
+}
+
+#[test]
+fn what_was_written_is_read_back_frame_by_frame() {
+    let mut bytes = Vec::new();
+    write_start(&mut bytes).unwrap();
+    write_frame(&mut bytes, b"abc").unwrap();
+    let mut frames = FrameReader::new(&bytes[MAGIC.len() + 4..], 0);
+    assert!(matches!(frames.read().unwrap(), Next::Payload(b"abc")));
+    assert!(matches!(frames.read().unwrap(), Next::End));
+}

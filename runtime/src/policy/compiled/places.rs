@@ -1,0 +1,83 @@
+//! Where a tick's inputs and outputs lie among the values: found by name once, when a bundle is loaded.
+
+use rcwm_models::bundle::PartName;
+
+use super::pieces::{Piece, Place, Values};
+use crate::compile::{CompileError, inputs};
+
+/// Places of a whole tick; none for an input that no segment reads.
+pub(super) struct Places {
+    pub(super) image: Option<Place>,
+    pub(super) action: Option<Place>,
+    pub(super) robot: BranchPlaces,
+    pub(super) environment: BranchPlaces,
+    pub(super) e: Place,
+    pub(super) attention: Place,
+    pub(super) mean: Place,
+    pub(super) std: Place,
+}
+
+/// Places of a branch.
+pub(super) struct BranchPlaces {
+    pub(super) z: Option<Place>,
+    pub(super) h: Option<Place>,
+    pub(super) noise: Option<Place>,
+    pub(super) h_next: Place,
+    pub(super) prior_z: Place,
+    pub(super) prior_log_probs: Place,
+    pub(super) posterior_z: Place,
+    pub(super) posterior_log_probs: Place,
+}
+
+impl Places {
+    /// Of a tick of which `early` runs before the image is there.
+    pub(super) fn of(values: &Values, early: &[Piece]) -> Result<Self, CompileError> {
+        let output = |part, name: &str| output(values, part, name);
+        let robot = [inputs::ROBOT_Z, inputs::ROBOT_H, inputs::ROBOT_NOISE];
+        let environment = [inputs::ENVIRONMENT_Z, inputs::ENVIRONMENT_H, inputs::ENVIRONMENT_NOISE];
+        Ok(Self {
+            image: values.find(inputs::IMAGE),
+            action: values.find(inputs::ACTION),
+            robot: BranchPlaces::of(values, PartName::Robot, robot, early)?,
+            environment: BranchPlaces::of(values, PartName::Environment, environment, early)?,
+            e: output(PartName::Interaction, "e")?,
+            attention: output(PartName::Interaction, "attention")?,
+            mean: output(PartName::Actor, "mean")?,
+            std: output(PartName::Actor, "std")?,
+        })
+    }
+
+    /// Both branches by name, in the order of [`super::Buffers::branches`].
+    pub(super) fn branches(&self) -> [&BranchPlaces; 2] {
+        [&self.robot, &self.environment]
+    }
+}
+
+impl BranchPlaces {
+    fn of(values: &Values, part: PartName, inputs: [&str; 3], early: &[Piece]) -> Result<Self, CompileError> {
+        let prior = |name| {
+            let place = output(values, part, name)?;
+            if early.iter().any(|piece| piece.makes(place)) {
+                return Ok(place);
+            }
+            let reason = format!("{part}/{name} depends on the image; a prior must not");
+            Err(CompileError::Part { part, reason })
+        };
+        let [z, h, noise] = inputs.map(|name| values.find(name));
+        Ok(Self {
+            z,
+            h,
+            noise,
+            h_next: prior("h_next")?,
+            prior_z: prior("prior_z")?,
+            prior_log_probs: prior("prior_log_probs")?,
+            posterior_z: output(values, part, "posterior_z")?,
+            posterior_log_probs: output(values, part, "posterior_log_probs")?,
+        })
+    }
+}
+
+fn output(values: &Values, part: PartName, name: &str) -> Result<Place, CompileError> {
+    let reason = || format!("nothing makes {part}/{name}");
+    values.find(&format!("{part}/{name}")).ok_or_else(|| CompileError::Part { part, reason: reason() })
+}
