@@ -171,7 +171,7 @@ fn settings(kind: ModelKind) -> TrainingSettings {
 
 fn learn(fewshot: &mut Fewshot, until: u64) -> Outcome {
     let stop = AtomicBool::new(false);
-    fewshot.run(replay(), &stop, |updates, _| stop.store(updates >= until, Ordering::Relaxed)).unwrap()
+    fewshot.run(replay(), &stop, |progress| stop.store(progress.updates >= until, Ordering::Relaxed)).unwrap()
 }
 
 fn updates_logged(folder: &Path) -> Vec<u64> {

@@ -14,7 +14,9 @@ use rcwm_models::settings::{ModelKind, Preset};
 use rcwm_trainer::checkpoint::Checkpoint;
 use rcwm_trainer::model::parameters::Parameters;
 use rcwm_trainer::replay::Replay;
-use rcwm_trainer::training::{Compute, Outcome, Pretraining, Progress, Run, TrainingError, TrainingSettings};
+use rcwm_trainer::training::{
+    Compute, Line, Outcome, Pretraining, Progress, Run, TrainingError, TrainingSettings,
+};
 
 /// A bright square, the robot, that moves over a dark ground with the action.
 fn episode(steps: usize, shift: usize, masked: bool) -> Episode {
@@ -226,12 +228,11 @@ fn masks_count_in_the_warm_up_only_and_losses_fall() {
     settings.world.adam.learning_rate = 1e-3;
     let mut training = Pretraining::create(folder.path(), settings, &Device::Cpu).unwrap();
     let mut lines = Vec::new();
-    training
-        .run(replay(), &AtomicBool::new(false), |progress| lines.extend(progress.metrics.cloned()))
-        .unwrap();
+    training.run(replay(), &AtomicBool::new(false), |progress| lines.extend(progress.line.cloned())).unwrap();
     assert_eq!(lines.len(), 20);
-    assert!(lines.iter().all(|line| line.losses.robot_mask.is_some() == (line.phase == "warm_up")));
-    assert!(lines[19].losses.image < 0.7 * lines[0].losses.image, "{:?}", lines[19]);
+    assert!(lines.iter().all(|line| line.number("losses.robot_mask").is_some() == (line.phase == "warm_up")));
+    let image = |line: &Line| line.number("losses.image").unwrap();
+    assert!(image(&lines[19]) < 0.7 * image(&lines[0]), "{:?}", lines[19]);
 }
 
 #[test]

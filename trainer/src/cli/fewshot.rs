@@ -82,9 +82,9 @@ impl Fewshot {
         };
         let bar = bars::updates(settings.fewshot.updates(), learning.updates());
         let bar = bars::Bar::new(bar, "", "updates");
-        let outcome = learning.run(replay, &stop, |updates, line| {
-            bar.set_position(updates);
-            if let Some(line) = line {
+        let outcome = learning.run(replay, &stop, |progress| {
+            bar.set_position(progress.updates);
+            if let Some(line) = progress.line {
                 bar.set_message(describe(line));
             }
         })?;

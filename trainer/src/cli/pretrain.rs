@@ -8,7 +8,7 @@ use indicatif::{MultiProgress, ProgressBar, ProgressStyle};
 use rcwm_models::terminal::LINE_EVERY;
 use rcwm_trainer::replay::{Folder, Replay};
 use rcwm_trainer::training::{
-    HeldOutLosses, Metrics, Pretraining, Progress, Run, TrainingError, TrainingSettings,
+    HeldOutLosses, Line, Pretraining, Progress, Run, TrainingError, TrainingSettings,
 };
 
 use super::bars::{self, absolute};
@@ -214,8 +214,8 @@ fn load(settings: &TrainingSettings) -> Result<Replay> {
 
 fn show(bar: &ProgressBar, name: &str, shown: &mut Instant, progress: &Progress<'_>) {
     bar.set_position(progress.updates);
-    if let Some(metrics) = progress.metrics {
-        bar.set_message(describe(metrics));
+    if let Some(line) = progress.line {
+        bar.set_message(describe(line));
     }
     if bar.is_hidden() && shown.elapsed() >= LINE_EVERY {
         *shown = Instant::now();
@@ -229,21 +229,21 @@ fn show(bar: &ProgressBar, name: &str, shown: &mut Instant, progress: &Progress<
     }
 }
 
-fn describe(metrics: &Metrics) -> String {
-    let losses = &metrics.losses;
-    let optional = |name: &str, value: Option<f64>| {
-        value.map_or_else(String::new, |value| format!(" {name} {value:.1}"))
+fn describe(line: &Line) -> String {
+    let number = |name: &str| line.number(name).unwrap_or_default();
+    let optional = |name: &str, text: &str, digits: usize| {
+        line.number(name).map_or_else(String::new, |value| format!("{text}{value:.digits$}"))
     };
     format!(
         "{} {:.2} updates/s, waiting {:.0}%  total {:.1} image {:.1}{} reward {:.3} kl {:.2}{}",
-        metrics.phase,
-        metrics.updates_per_second,
-        100.0 * metrics.waiting_share,
-        losses.total,
-        losses.image,
-        optional("mask", losses.robot_mask),
-        losses.reward,
-        losses.robot_kl,
-        losses.environment_kl.map_or_else(String::new, |kl| format!(" + {kl:.2}")),
+        line.phase,
+        number("updates_per_second"),
+        100.0 * number("waiting_share"),
+        number("losses.total"),
+        number("losses.image"),
+        optional("losses.robot_mask", " mask ", 1),
+        number("losses.reward"),
+        number("losses.robot_kl"),
+        optional("losses.environment_kl", " + ", 2),
     )
 }

@@ -139,6 +139,11 @@ impl Interval {
         *self.spent.entry(on).or_default() += time;
     }
 
+    /// Counts as if this time had not passed.
+    pub fn leave_out(&mut self, time: Duration) {
+        self.begin += time;
+    }
+
     /// The line that ends here; the next one begins.
     pub fn end(&mut self, update: u64, phase: &'static str) -> Line {
         let done = std::mem::replace(self, Self::begin());

@@ -1,20 +1,18 @@
 use std::path::Path;
 use std::sync::Arc;
-use std::sync::atomic::{AtomicBool, Ordering};
+use std::sync::atomic::AtomicBool;
 
 use candle_core::{Device, Tensor};
 use rcwm_models::episode::Episode;
 use rcwm_models::settings::ModelKind;
 use serde_json::json;
 
-use super::film::{Scene, write_films};
-use super::run::Resume;
+use super::update_loop::{Core, Outcome, Progress, Updated, Updates, make_all_updates};
 use super::{
-    Best, FewshotSettings, Interval, Line, Outcome, Phase, Run, TimeBucket, TrainingError, TrainingSettings,
-    TrainingState, start_from,
+    Best, FewshotSettings, HeldOutLosses, Phase, TimeBucket, TrainingError, TrainingSettings, start_from,
 };
 use crate::checkpoint::Checkpoint;
-use crate::cloning::CloningLearner;
+use crate::cloning::{CloningLearner, CloningSettings};
 use crate::learning::{
     Examples, Imitation, Side, Trained, Views, WorldLearner, cloning_loss, side_of, state_of_features,
 };
@@ -79,15 +77,9 @@ impl Stage {
 /// A new task from demonstrations alone: see [`FewshotSettings`].
 #[derive(Debug)]
 pub struct Fewshot {
-    settings: TrainingSettings,
-    device: Device,
-    run: Run,
-    parameters: Parameters,
+    core: Core,
     world: WorldLearner,
     cloning: CloningLearner,
-    state: TrainingState,
-    scenes: Vec<Scene>,
-    held_out: Vec<Arc<Episode>>,
 }
 
 impl Fewshot {
@@ -98,78 +90,55 @@ impl Fewshot {
         source: &Checkpoint,
         device: &Device,
     ) -> Result<Self, TrainingError> {
-        settings.validate()?;
         if source.settings.model != settings.model {
+            settings.validate()?;
             return Err(TrainingError::OtherModel);
         }
-        let run = Run::create(folder, &settings)?;
-        Self::fresh(run, settings, source, device)
+        let begin = |settings: &TrainingSettings, device: &Device| {
+            Ok(start_from(source, &settings.reset, settings.seed, device)?)
+        };
+        Self::of(Core::create(folder, settings, device.clone(), begin)?)
     }
 
-    fn fresh(
-        run: Run,
-        settings: TrainingSettings,
-        source: &Checkpoint,
-        device: &Device,
-    ) -> Result<Self, TrainingError> {
-        let parameters = start_from(source, &settings.reset, settings.seed, device)?;
-        Self::of(run, settings, parameters, TrainingState::default(), device)
-    }
-
-    fn of(
-        run: Run,
-        settings: TrainingSettings,
-        parameters: Parameters,
-        state: TrainingState,
-        device: &Device,
-    ) -> Result<Self, TrainingError> {
-        let model = &settings.model;
-        let world = WorldLearner::new(&parameters, model, &settings.world, Trained::World)?;
-        let cloning =
-            CloningLearner::new(&parameters, model, &settings.fewshot.cloning, &settings.behaviour)?;
-        Ok(Self {
-            settings,
-            device: device.clone(),
-            run,
-            parameters,
-            world,
-            cloning,
-            state,
-            scenes: Vec::new(),
-            held_out: Vec::new(),
-        })
+    fn of(core: Core) -> Result<Self, TrainingError> {
+        let TrainingSettings { model, world, behaviour, fewshot, .. } = &core.settings;
+        let world = WorldLearner::new(&core.parameters, model, world, Trained::World)?;
+        let cloning = CloningLearner::new(&core.parameters, model, &fewshot.cloning, behaviour)?;
+        Ok(Self { core, world, cloning })
     }
 
     /// Goes on with the run in `folder` from its newest checkpoint, or from the beginning if there is none yet.
     pub fn resume(folder: &Path, settings: TrainingSettings, device: &Device) -> Result<Self, TrainingError> {
-        let (run, parameters, state, moments) =
-            match Run::go_on(folder, &settings, &[Phase::Fewshot], device)? {
-                Resume::FromStart(run) => {
-                    let source = Checkpoint::read(&settings.from, device)?;
-                    return Self::fresh(run, settings, &source, device);
-                }
-                Resume::From { run, parameters, state, moments } => (run, parameters, state, moments),
-            };
-        let mut this = Self::of(run, settings, parameters, state, device)?;
-        let adam = |name: &str, settings| this.state.optimiser(name, settings, &moments, &this.parameters);
-        let [world, actor, critic] = OPTIMISERS;
-        *this.world.adam_mut() = adam(world, &this.settings.world.adam)?;
-        let actor = adam(actor, &this.settings.fewshot.cloning.actor)?;
-        let critic = adam(critic, &this.settings.behaviour.critic)?;
-        this.cloning.resume(actor, critic, this.state.return_range);
+        let begin = |settings: &TrainingSettings, device: &Device| {
+            let source = Checkpoint::read(&settings.from, device)?;
+            Ok(start_from(&source, &settings.reset, settings.seed, device)?)
+        };
+        let (core, moments) = Core::resume(folder, settings, device.clone(), &[Phase::Fewshot], begin)?;
+        let mut this = Self::of(core)?;
+        let Self { core, world, cloning } = &mut this;
+        let settings = &core.settings;
+        let [of_world, actor, critic] = OPTIMISERS;
+        if let Some(adam) = core.adam(of_world, &settings.world.adam, &moments)? {
+            *world.adam_mut() = adam;
+        }
+        let actor = core.adam(actor, &settings.fewshot.cloning.actor, &moments)?;
+        let critic = core.adam(critic, &settings.behaviour.critic, &moments)?;
+        if let (Some(actor), Some(critic)) = (actor, critic) {
+            cloning.resume(actor, critic, core.state.return_range);
+        }
         Ok(this)
     }
 
     /// Updates made so far.
     #[must_use]
     pub fn updates(&self) -> u64 {
-        self.state.updates
+        self.core.state.updates
     }
 
     /// The parameters, as they are.
     #[must_use]
     pub fn parameters(&self) -> &Parameters {
-        &self.parameters
+        &self.core.parameters
     }
 
     /// Learns from the demonstrations in `replay` until all updates are made or `stop` is set; either way ends with a checkpoint.
@@ -180,48 +149,73 @@ impl Fewshot {
         &mut self,
         replay: Replay,
         stop: &AtomicBool,
-        mut show: impl FnMut(u64, Option<&Line>),
+        show: impl FnMut(&Progress<'_>),
     ) -> Result<Outcome, TrainingError> {
-        let total = self.settings.fewshot.updates();
-        let (replay, held_out) = replay.hold_out(self.settings.fewshot.held_out);
-        self.scenes = self.settings.film.scenes(if held_out.episodes() > 0 { &held_out } else { &replay });
+        let Self { core, world, cloning } = self;
+        let settings = &core.settings;
+        let (replay, held_out) = replay.hold_out(settings.fewshot.held_out);
+        core.scenes = settings.film.scenes(if held_out.episodes() > 0 { &held_out } else { &replay });
         let of = |replay: &Replay| replay.tasks().flat_map(|(_, episodes)| episodes).cloned().collect();
-        let episodes: Vec<_> = of(&replay);
-        self.held_out = of(&held_out);
-        let mut work = Work { batches: None, replay, examples: None, stage: None };
-        let mut interval = Interval::begin();
-        let mut saved_at = None;
-        while self.state.updates < total && !stop.load(Ordering::Relaxed) {
-            let (stage, number) = Stage::of(&self.settings.fewshot, self.state.updates);
-            if work.stage != Some(stage) {
-                self.enter(stage, number, &mut work, &episodes)?;
-            }
-            self.update(stage, number, &mut work, &mut interval)?;
-            self.state.updates += 1;
-            let updates = self.state.updates;
-            self.run.ema_update(&self.parameters, self.moved(stage), updates)?;
-            let line = updates
-                .is_multiple_of(self.settings.metrics_every)
-                .then(|| interval.end(updates, stage.name()));
-            if let Some(line) = &line {
-                self.run.log(line)?;
-            }
-            if updates.is_multiple_of(self.settings.checkpoint_every) {
-                self.save()?;
-                saved_at = Some(updates);
-            }
-            show(updates, line.as_ref());
-        }
-        if saved_at != Some(self.state.updates) {
-            self.save()?;
-        }
-        Ok(Outcome { updates: self.state.updates, interrupted: self.state.updates < total })
+        let (episodes, held_out) = (of(&replay), of(&held_out));
+        let until = settings.fewshot.updates();
+        let (stage, batches, examples) = (None, None, None);
+        let mut running =
+            Running { core, world, cloning, replay, episodes, held_out, stage, batches, examples };
+        make_all_updates(&mut running, until, stop, show)
+    }
+}
+
+/// Few-shot learning under way.
+struct Running<'a> {
+    core: &'a mut Core,
+    world: &'a mut WorldLearner,
+    cloning: &'a mut CloningLearner,
+    replay: Replay,
+    /// The demonstrations.
+    episodes: Vec<Arc<Episode>>,
+    /// Demonstrations that are not learned from.
+    held_out: Vec<Arc<Episode>>,
+    stage: Option<Stage>,
+    /// What the present stage works on.
+    batches: Option<Prefetch>,
+    examples: Option<Examples>,
+}
+
+impl Updates for Running<'_> {
+    fn core(&mut self) -> &mut Core {
+        self.core
     }
 
+    fn update(&mut self) -> Result<Updated, TrainingError> {
+        let (stage, number) = Stage::of(&self.core.settings.fewshot, self.core.state.updates);
+        if self.stage != Some(stage) {
+            self.enter(stage, number)?;
+        }
+        self.update_in(stage, number)?;
+        Ok((stage.name(), Some(self.moved(stage))))
+    }
+
+    fn save(&mut self) -> Result<Option<HeldOutLosses>, TrainingError> {
+        let agent = self.core.agent()?;
+        if !self.held_out.is_empty() {
+            let cloning = self.held_out_cloning(&agent)?;
+            let update = self.core.state.updates;
+            self.core.run.log(&json!({"update": update, "held_out": {"cloning": cloning}}))?;
+        }
+        let Self { core, world, cloning, .. } = self;
+        core.state.return_range = cloning.return_range();
+        let [actor, critic] = cloning.adams();
+        let optimisers: Vec<_> = OPTIMISERS.into_iter().zip([world.adam(), actor, critic]).collect();
+        core.write(&agent, &optimisers, Best::No, 0)?;
+        Ok(None)
+    }
+}
+
+impl Running<'_> {
     /// Which parameters an update of the stage may move.
     fn moved(&self, stage: Stage) -> fn(&str) -> bool {
         match stage {
-            Stage::Actor if !self.settings.fewshot.world_goes_on => {
+            Stage::Actor if !self.core.settings.fewshot.world_goes_on => {
                 |name| matches!(side_of(name), Side::Actor | Side::Critic | Side::SlowCritic)
             }
             _ => |_| true,
@@ -229,33 +223,28 @@ impl Fewshot {
     }
 
     /// Prepares what the stage needs from its update `number` on.
-    fn enter(
-        &mut self,
-        stage: Stage,
-        number: u64,
-        work: &mut Work,
-        episodes: &[Arc<Episode>],
-    ) -> Result<(), TrainingError> {
-        work.stage = Some(stage);
+    fn enter(&mut self, stage: Stage, number: u64) -> Result<(), TrainingError> {
+        self.stage = Some(stage);
+        let core = &*self.core;
         if stage == Stage::Actor && number == 0 {
             // The actor learns on the states that the deployed world model will give it.
-            self.parameters.mix(&self.run.ema_weights(&self.parameters), 1.0, |_| true)?;
+            core.parameters.mix(&core.run.ema_weights(&core.parameters), 1.0, |_| true)?;
         }
-        let fewshot = &self.settings.fewshot;
+        let fewshot = &core.settings.fewshot;
         let imitation = Imitation {
             scale: fewshot.imitation_scale,
             loss: fewshot.cloning.loss,
-            learning_rate: self.settings.world.adam.learning_rate,
+            learning_rate: core.settings.world.adam.learning_rate,
         };
         let imitation = (stage != Stage::Actor && imitation.scale > 0.0).then_some(imitation);
-        self.world.train(stage.trained(self.settings.model.kind, imitation.is_some()), imitation)?;
-        let seed = self.settings.seed;
+        self.world.train(stage.trained(core.settings.model.kind, imitation.is_some()), imitation)?;
+        let seed = core.settings.seed;
         if stage != Stage::Actor || fewshot.world_goes_on {
-            if work.batches.is_none() {
-                let (sizes, mut replay) = (self.settings.replay.clone(), work.replay.clone());
+            if self.batches.is_none() {
+                let (sizes, mut replay) = (core.settings.replay.clone(), self.replay.clone());
                 replay.look(&sizes.look);
                 let (shift, starts) = (fewshot.shift, fewshot.starts);
-                work.batches = Some(Prefetch::start(self.state.updates, sizes.prefetch, move |number| {
+                self.batches = Some(Prefetch::start(core.state.updates, sizes.prefetch, move |number| {
                     let seed = seed ^ REPLAY_STREAM;
                     let mut batch =
                         replay.draw_from(starts, sizes.batch, sizes.length, false, seed, number)?;
@@ -265,53 +254,44 @@ impl Fewshot {
             }
             return Ok(());
         }
-        work.batches = None;
-        let agent = Agent::new(&self.parameters.frozen(), &self.settings.model)?;
+        self.batches = None;
+        let agent = Agent::new(&core.parameters.frozen(), &core.settings.model)?;
         let views =
             Views { draws: fewshot.cloning.draws, shift: fewshot.shift, seed: seed ^ EXAMPLES_STREAM };
-        work.examples = Some(Examples::filter(&agent, episodes, &views, &self.device)?);
+        self.examples = Some(Examples::filter(&agent, &self.episodes, &views, &core.device)?);
         Ok(())
     }
 
-    fn update(
-        &mut self,
-        stage: Stage,
-        number: u64,
-        work: &mut Work,
-        interval: &mut Interval,
-    ) -> Result<(), TrainingError> {
-        let mut sampler = Sampler::numbered(self.settings.seed, self.state.updates);
-        if let (Stage::Actor, Some(examples)) = (stage, &work.examples) {
-            return self.clone_from_examples(number, examples, &mut sampler, interval);
+    fn update_in(&mut self, stage: Stage, number: u64) -> Result<(), TrainingError> {
+        let Self { core, world, batches, .. } = self;
+        let mut sampler = Sampler::numbered(core.settings.seed, core.state.updates);
+        if stage == Stage::Actor && self.examples.is_some() {
+            return self.clone_from_examples(number, &mut sampler);
         }
-        let batches = work.batches.as_mut().expect("entering a stage that draws batches starts them");
-        let batch = interval.time(TimeBucket::WaitingForBatches, || batches.next_batch())?;
-        let batch = batch.into_tensors(&self.device)?;
-        let update = interval.time(TimeBucket::Learning, || self.world.update(&batch, &mut sampler))?;
+        let batches = batches.as_mut().expect("entering a stage that draws batches starts them");
+        let batch = core.interval.time(TimeBucket::WaitingForBatches, || batches.next_batch())?;
+        let batch = batch.into_tensors(&core.device)?;
+        let update = core.interval.time(TimeBucket::Learning, || world.update(&batch, &mut sampler))?;
         let losses = json!({"losses": update.losses, "gradient_norm": update.gradient_norm});
         if stage == Stage::Actor {
             let examples = Examples::of_batch(&update.posteriors.features()?, &batch)?;
-            return self.clone_from_batch(number, examples, losses, &mut sampler, interval);
+            return self.clone_from_batch(number, examples, losses, &mut sampler);
         }
-        interval.update(&losses);
+        core.interval.update(&losses);
         Ok(())
     }
 
-    fn clone_from_examples(
-        &mut self,
-        number: u64,
-        examples: &Examples,
-        sampler: &mut Sampler,
-        interval: &mut Interval,
-    ) -> Result<(), TrainingError> {
-        let settings = &self.settings.fewshot.cloning;
-        let (rows, starts) = (settings.rows, settings.imagination_rows);
-        let seed = self.settings.seed ^ ROWS_STREAM;
+    fn clone_from_examples(&mut self, number: u64, sampler: &mut Sampler) -> Result<(), TrainingError> {
+        let Self { core, cloning, examples, .. } = self;
+        let examples = examples.as_ref().expect("the actor's stage begins with them");
+        let Core { settings, state, interval, .. } = &mut **core;
+        let CloningSettings { rows, imagination_rows: starts, .. } = settings.fewshot.cloning;
+        let seed = settings.seed ^ ROWS_STREAM;
         let update = interval.time(TimeBucket::Learning, || {
-            let (features, actions) = examples.draw(rows.max(starts), seed, self.state.updates)?;
-            let start = || state_of_features(&features.narrow(0, 0, starts)?, &self.settings.model);
+            let (features, actions) = examples.draw(rows.max(starts), seed, state.updates)?;
+            let start = || state_of_features(&features.narrow(0, 0, starts)?, &settings.model);
             let (few, taken) = (features.narrow(0, 0, rows)?, actions.narrow(0, 0, rows)?);
-            self.cloning.update(number, &few, &taken, start, sampler)
+            cloning.update(number, &few, &taken, start, sampler)
         })?;
         interval.update(&json!({"cloning": update}));
         Ok(())
@@ -324,12 +304,13 @@ impl Fewshot {
         (features, actions): (Tensor, Tensor),
         mut values: serde_json::Value,
         sampler: &mut Sampler,
-        interval: &mut Interval,
     ) -> Result<(), TrainingError> {
-        let starts = self.settings.fewshot.cloning.imagination_rows.min(features.dim(0)?);
+        let Self { core, cloning, .. } = self;
+        let Core { settings, interval, .. } = &mut **core;
+        let starts = settings.fewshot.cloning.imagination_rows.min(features.dim(0)?);
         let update = interval.time(TimeBucket::Learning, || {
-            let start = || state_of_features(&features.narrow(0, 0, starts)?, &self.settings.model);
-            self.cloning.update(number, &features, &actions, start, sampler)
+            let start = || state_of_features(&features.narrow(0, 0, starts)?, &settings.model);
+            cloning.update(number, &features, &actions, start, sampler)
         })?;
         values["cloning"] = json!(update);
         interval.update(&values);
@@ -339,33 +320,9 @@ impl Fewshot {
     /// How far the actor is from what was done in demonstrations that it does not learn from.
     fn held_out_cloning(&self, agent: &Agent) -> Result<f32, TrainingError> {
         let views = Views { draws: 1, shift: 0, seed: 0 };
-        let examples = Examples::filter(agent, &self.held_out, &views, &self.device)?;
+        let examples = Examples::filter(agent, &self.held_out, &views, &self.core.device)?;
         let (features, actions) = examples.all();
-        let loss = cloning_loss(&agent.actor, features, actions, self.settings.fewshot.cloning.loss)?;
+        let loss = cloning_loss(&agent.actor, features, actions, self.core.settings.fewshot.cloning.loss)?;
         Ok(loss.to_scalar::<f32>()?)
     }
-
-    fn save(&mut self) -> Result<(), TrainingError> {
-        self.state.return_range = self.cloning.return_range();
-        let [actor, critic] = self.cloning.adams();
-        let [world_name, actor_name, critic_name] = OPTIMISERS;
-        let optimisers = [(world_name, self.world.adam()), (actor_name, actor), (critic_name, critic)];
-        self.run.save(&self.parameters, &self.settings, &self.state, &optimisers, Best::No)?;
-        let agent = Agent::new(&self.run.ema_weights(&self.parameters).frozen(), &self.settings.model)?;
-        if !self.held_out.is_empty() {
-            let cloning = self.held_out_cloning(&agent)?;
-            self.run.log(&json!({"update": self.state.updates, "held_out": {"cloning": cloning}}))?;
-        }
-        self.run.draw_curves(0)?;
-        let (film, update) = (&self.settings.film, self.state.updates);
-        write_films(&self.run, &agent, &self.scenes, film, update, &self.device)
-    }
-}
-
-/// What the present stage works on.
-struct Work {
-    replay: Replay,
-    stage: Option<Stage>,
-    batches: Option<Prefetch>,
-    examples: Option<Examples>,
 }

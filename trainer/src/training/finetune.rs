@@ -10,11 +10,10 @@ use serde_json::json;
 
 use super::compute::{AgentUpdates, Compute};
 use super::evaluations::evaluate;
-use super::film::{Scene, write_films};
 use super::prefill::{Prefilled, policy_episode, prefill};
-use super::run::Resume;
-use super::{EpisodeFacts, EpisodeLine, EvaluationLine, OnlineOutcome, OnlineProgress};
-use super::{Interval, Phase, Run, TimeBucket, TrainingError, TrainingSettings, TrainingState, start_from};
+use super::update_loop::{Core, Updated, Updates, make_updates};
+use super::{EpisodeFacts, EpisodeLine, EvaluationLine, HeldOutLosses, Line, OnlineOutcome, OnlineProgress};
+use super::{Interval, Phase, TimeBucket, TrainingError, TrainingSettings, TrainingState, start_from};
 use crate::acting::{Fleet, Gathered, Policy, Recorded};
 use crate::checkpoint::Checkpoint;
 use crate::model::agent::{self, Agent};
@@ -44,20 +43,16 @@ const ACTION_REPEAT: u64 = 2;
 /// since the checkpoint count as not made, although their whole episodes are replayed.
 #[derive(Debug)]
 pub struct Finetuning {
-    settings: TrainingSettings,
-    device: Device,
+    core: Core,
     folder: PathBuf,
-    run: Run,
-    parameters: Parameters,
     updates: AgentUpdates,
+    batches: Option<Prefetch>,
     /// Updates that the weights which act have seen.
     acting_since: u64,
-    state: TrainingState,
     newest: VecDeque<bool>,
     refused_actions: u64,
     /// Evaluations that are behind it.
     evaluations: u64,
-    scenes: Vec<Scene>,
 }
 
 impl Finetuning {
@@ -68,57 +63,32 @@ impl Finetuning {
         source: Option<&Checkpoint>,
         compute: impl Into<Compute>,
     ) -> Result<Self, TrainingError> {
-        settings.validate()?;
         if source.is_some_and(|source| source.settings.model != settings.model) {
+            settings.validate()?;
             return Err(TrainingError::OtherModel);
         }
-        let run = Run::create(folder, &settings)?;
-        Self::fresh(folder, run, settings, source, compute.into())
+        let compute = compute.into();
+        let begin = |settings: &TrainingSettings, device: &Device| begin(settings, source, device);
+        let core = Core::create(folder, settings, compute.device(), begin)?;
+        Self::of(folder, core, compute)
     }
 
-    fn fresh(
-        folder: &Path,
-        run: Run,
-        settings: TrainingSettings,
-        source: Option<&Checkpoint>,
-        compute: Compute,
-    ) -> Result<Self, TrainingError> {
-        let device = compute.device();
-        let parameters = match source {
-            Some(source) => start_from(source, &settings.reset, settings.seed, &device)?,
-            None => agent::initialise(&settings.model, settings.seed, &device)?,
+    fn of(folder: &Path, core: Core, compute: Compute) -> Result<Self, TrainingError> {
+        let (settings, state) = (&core.settings, &core.state);
+        // That of a checkpoint's own step was made before it.
+        let evaluations = match state.policy_steps {
+            0 => 0,
+            steps => settings.finetune.evaluation.due(steps),
         };
-        Self::of(folder, run, settings, parameters, TrainingState::default(), compute)
-    }
-
-    fn of(
-        folder: &Path,
-        run: Run,
-        settings: TrainingSettings,
-        parameters: Parameters,
-        state: TrainingState,
-        compute: Compute,
-    ) -> Result<Self, TrainingError> {
-        let device = compute.device();
-        let updates = AgentUpdates::new(compute, &settings, &parameters)?;
         Ok(Self {
-            device,
             folder: folder.to_path_buf(),
-            run,
-            parameters,
-            updates,
+            updates: AgentUpdates::new(compute, settings, &core.parameters)?,
+            batches: None,
             acting_since: state.updates,
-            // That of a checkpoint's own step was made before it.
-            evaluations: if state.policy_steps > 0 {
-                settings.finetune.evaluation.due(state.policy_steps)
-            } else {
-                0
-            },
-            settings,
-            state,
             newest: VecDeque::new(),
             refused_actions: 0,
-            scenes: Vec::new(),
+            evaluations,
+            core,
         })
     }
 
@@ -129,39 +99,37 @@ impl Finetuning {
         compute: impl Into<Compute>,
     ) -> Result<Self, TrainingError> {
         let compute = compute.into();
-        let device = compute.device();
-        let phases = [Phase::Finetune, Phase::Train];
-        let (run, parameters, state, moments) = match Run::go_on(folder, &settings, &phases, &device)? {
-            Resume::FromStart(run) => {
-                let source = match settings.phase {
-                    Phase::Finetune => Some(Checkpoint::read(&settings.from, &device)?),
-                    _ => None,
-                };
-                return Self::fresh(folder, run, settings, source.as_ref(), compute);
-            }
-            Resume::From { run, parameters, state, moments } => (run, parameters, state, moments),
+        let begin = |settings: &TrainingSettings, device: &Device| {
+            let source = match settings.phase {
+                Phase::Finetune => Some(Checkpoint::read(&settings.from, device)?),
+                _ => None,
+            };
+            begin(settings, source.as_ref(), device)
         };
-        let mut this = Self::of(folder, run, settings, parameters, state, compute)?;
-        let adam = |name: &str, settings| this.state.optimiser(name, settings, &moments, &this.parameters);
-        let [world, actor, critic] = OPTIMISERS;
-        let world = adam(world, &this.settings.world.adam)?;
-        let actor = adam(actor, &this.settings.behaviour.actor)?;
-        let critic = adam(critic, &this.settings.behaviour.critic)?;
-        let range = this.state.return_range;
-        this.updates.resume([world, actor, critic], range)?;
+        let phases = [Phase::Finetune, Phase::Train];
+        let (core, moments) = Core::resume(folder, settings, compute.device(), &phases, begin)?;
+        let mut this = Self::of(folder, core, compute)?;
+        let (core, TrainingSettings { world, behaviour, .. }) = (&this.core, &this.core.settings);
+        let of = [&world.adam, &behaviour.actor, &behaviour.critic];
+        let adams =
+            OPTIMISERS.into_iter().zip(of).map(|(name, settings)| core.adam(name, settings, &moments));
+        let adams: Vec<_> = adams.collect::<Result<Vec<_>, _>>()?.into_iter().flatten().collect();
+        if let Ok(adams) = <[_; 3]>::try_from(adams) {
+            this.updates.resume(adams, this.core.state.return_range)?;
+        }
         Ok(this)
     }
 
     /// What has been done so far.
     #[must_use]
     pub fn state(&self) -> &TrainingState {
-        &self.state
+        &self.core.state
     }
 
     /// The parameters, as they are.
     #[must_use]
     pub fn parameters(&self) -> &Parameters {
-        &self.parameters
+        &self.core.parameters
     }
 
     /// Fills the replay, see [`prefill`].
@@ -170,7 +138,7 @@ impl Finetuning {
         stop: &AtomicBool,
         progress: &(dyn Fn(Progress) + Sync),
     ) -> Result<Prefilled, TrainingError> {
-        prefill(&self.folder, &self.settings, stop, progress)
+        prefill(&self.folder, &self.core.settings, stop, progress)
     }
 
     /// Acts and learns until all steps are made, every simulator has ended, or `stop` is set; any way ends with a checkpoint.
@@ -184,51 +152,53 @@ impl Finetuning {
         stop: &AtomicBool,
         mut show: impl FnMut(&OnlineProgress<'_>),
     ) -> Result<OnlineOutcome, TrainingError> {
-        let most = self.settings.finetune.success_episodes;
+        let most = self.core.settings.finetune.success_episodes;
         self.newest = filled.policy_successes.iter().rev().take(most).rev().copied().collect();
-        self.scenes = self.settings.film.scenes(&filled.replay);
+        self.core.scenes = self.core.settings.film.scenes(&filled.replay);
         let mut replay = filled.replay;
-        replay.look(&self.settings.replay.look);
+        replay.look(&self.core.settings.replay.look);
         let replay = SharedReplay::new(replay);
-        let mut learning = Learning { batches: self.prefetch(&replay)?, interval: Interval::begin() };
-        let done = self.work(&replay, &mut learning, join, stop, &mut show);
+        self.batches = Some(self.prefetch(&replay)?);
+        self.core.interval = Interval::begin();
+        let done = self.work(&replay, join, stop, &mut show);
+        self.batches = None;
         // What ended the work says more than what fails after it.
         if let Err(error) = self.write_back() {
             return Err(done.err().unwrap_or(error));
         }
         // Whatever happened: a model with a number that is not finite is never saved.
-        check_finite(&self.parameters)?;
+        check_finite(&self.core.parameters)?;
         self.save()?;
         done?;
         Ok(OnlineOutcome {
-            updates: self.state.updates,
-            policy_steps: self.state.policy_steps,
-            episodes: self.state.episodes,
+            updates: self.core.state.updates,
+            policy_steps: self.core.state.policy_steps,
+            episodes: self.core.state.episodes,
             success_rate: self.success_rate(),
             refused_actions: self.refused_actions,
-            interrupted: self.state.policy_steps < self.settings.finetune.steps,
+            interrupted: self.core.state.policy_steps < self.core.settings.finetune.steps,
         })
     }
 
     fn work(
         &mut self,
         replay: &SharedReplay,
-        learning: &mut Learning,
         join: &[String],
         stop: &AtomicBool,
         show: &mut impl FnMut(&OnlineProgress<'_>),
     ) -> Result<(), TrainingError> {
-        self.learn(learning, stop, show)?; // the warm-up
-        let steps = self.settings.finetune.steps;
-        if stop.load(Ordering::Relaxed) || self.state.policy_steps >= steps {
+        self.learn(stop, show)?; // the warm-up
+        let steps = self.core.settings.finetune.steps;
+        if stop.load(Ordering::Relaxed) || self.core.state.policy_steps >= steps {
             return Ok(());
         }
-        self.evaluate(learning, stop, show)?;
+        self.evaluate(stop, show)?;
         let mut fleet = Fleet::new(&self.launches(), join)?;
-        let agent = Agent::new(&self.parameters.frozen(), &self.settings.model)?;
-        let mut policy = Policy::new(agent, fleet.len(), &self.device);
-        while self.state.policy_steps < steps && !stop.load(Ordering::Relaxed) {
-            let gathered = learning.interval.time(TimeBucket::WaitingForSimulators, || fleet.gather(stop))?;
+        let agent = Agent::new(&self.core.parameters.frozen(), &self.core.settings.model)?;
+        let mut policy = Policy::new(agent, fleet.len(), &self.core.device);
+        while self.core.state.policy_steps < steps && !stop.load(Ordering::Relaxed) {
+            let gathered =
+                self.core.interval.time(TimeBucket::WaitingForSimulators, || fleet.gather(stop))?;
             if gathered.is_empty() {
                 break;
             }
@@ -239,10 +209,10 @@ impl Finetuning {
                     self.keep(recorded, replay, show)?;
                 }
             }
-            learning.interval.add(TimeBucket::Acting, begin.elapsed());
+            self.core.interval.add(TimeBucket::Acting, begin.elapsed());
             drop(gathered);
-            self.learn(learning, stop, show)?;
-            self.evaluate(learning, stop, show)?;
+            self.learn(stop, show)?;
+            self.evaluate(stop, show)?;
         }
         Ok(())
     }
@@ -250,85 +220,34 @@ impl Finetuning {
     /// Makes the updates that are due.
     fn learn(
         &mut self,
-        learning: &mut Learning,
         stop: &AtomicBool,
         show: &mut impl FnMut(&OnlineProgress<'_>),
     ) -> Result<(), TrainingError> {
-        let sizes = &self.settings.replay;
-        let due = self.settings.finetune.updates_due(self.state.policy_steps, sizes.batch * sizes.length);
-        while self.state.updates < due && !stop.load(Ordering::Relaxed) {
-            let phase = self.update(learning)?;
-            self.state.updates += 1;
-            let updates = self.state.updates;
-            let mut line = updates
-                .is_multiple_of(self.settings.metrics_every)
-                .then(|| learning.interval.end(updates, phase));
-            if let Some(line) = &mut line {
-                line.set("policy_steps", self.state.policy_steps as f64);
-                line.set("environment_steps", (ACTION_REPEAT * self.state.policy_steps) as f64);
-                line.set("refused_actions", self.refused_actions as f64);
-                self.success_rate().into_iter().for_each(|rate| line.set("success_rate", rate));
-                self.run.log(line)?;
-            }
-            if updates.is_multiple_of(self.settings.checkpoint_every) {
-                self.save()?;
-            }
-            show(&OnlineProgress { line: line.as_ref(), ..self.progress() });
-        }
+        let sizes = &self.core.settings.replay;
+        let due =
+            self.core.settings.finetune.updates_due(self.core.state.policy_steps, sizes.batch * sizes.length);
+        make_updates(self, due, stop, &mut |phase, progress| {
+            show(&OnlineProgress { line: progress.line, ..phase.progress() });
+        })?;
         // The policy acts next.
-        let since = self.state.updates.saturating_sub(self.acting_since);
-        if since >= self.settings.finetune.acting_weights_every || self.state.policy_steps == 0 {
+        let since = self.core.state.updates.saturating_sub(self.acting_since);
+        if since >= self.core.settings.finetune.acting_weights_every || self.core.state.policy_steps == 0 {
             self.write_back()?;
         }
         Ok(())
     }
 
-    fn update(&mut self, learning: &mut Learning) -> Result<&'static str, TrainingError> {
-        let Learning { batches, interval } = learning;
-        let number = self.state.updates;
-        let batch = interval.time(TimeBucket::WaitingForBatches, || batches.next_batch())?;
-        let warm_up = number < self.settings.finetune.warm_up_updates;
-        let (world, behaviour) = interval.time(TimeBucket::Learning, || {
-            self.updates.update(batch, (self.settings.seed, number), !warm_up)
-        })?;
-        let mut values = json!({"losses": world.losses, "gradient_norm": world.gradient_norm});
-        if let Some(behaviour) = behaviour {
-            values["behaviour"] = json!(behaviour);
-        }
-        interval.update(&values);
-        Ok(if warm_up { "warm_up" } else { ONLINE })
-    }
-
     fn write_back(&mut self) -> Result<(), TrainingError> {
-        self.acting_since = self.state.updates;
-        self.updates.write_back(&self.parameters)
+        self.acting_since = self.core.state.updates;
+        self.updates.write_back(&self.core.parameters)
     }
 
     fn prefetch(&self, replay: &SharedReplay) -> Result<Prefetch, TrainingError> {
-        let (sizes, replay) = (self.settings.replay.clone(), replay.clone());
-        let (seed, masks) = (self.settings.seed ^ REPLAY_STREAM, self.settings.finetune.masks);
-        Ok(Prefetch::start(self.state.updates, sizes.prefetch, move |number| {
+        let (sizes, replay) = (self.core.settings.replay.clone(), replay.clone());
+        let (seed, masks) = (self.core.settings.seed ^ REPLAY_STREAM, self.core.settings.finetune.masks);
+        Ok(Prefetch::start(self.core.state.updates, sizes.prefetch, move |number| {
             replay.draw(sizes.batch, sizes.length, masks, seed, number)
         })?)
-    }
-
-    /// Saves a checkpoint; it is the best if the newest episodes had the highest success rate of all checkpoints, the first of equals.
-    fn save(&mut self) -> Result<(), TrainingError> {
-        self.write_back()?;
-        self.state.return_range = self.updates.return_range();
-        let full = self.newest.len() == self.settings.finetune.success_episodes;
-        let success = self.success_rate().filter(|_| full);
-        let is_best = success.is_some_and(|rate| self.state.best_success.is_none_or(|best| rate > best));
-        if is_best {
-            self.state.best_success = success;
-        }
-        let adams = self.updates.adams(&self.parameters)?;
-        let optimisers: Vec<_> = OPTIMISERS.into_iter().zip(&adams).collect();
-        self.run.save(&self.parameters, &self.settings, &self.state, &optimisers, is_best.into())?;
-        self.run.draw_curves(self.settings.finetune.warm_up_updates)?;
-        let agent = Agent::new(&self.parameters.frozen(), &self.settings.model)?;
-        let (film, update) = (&self.settings.film, self.state.updates);
-        write_films(&self.run, &agent, &self.scenes, film, update, &self.device)
     }
 
     fn success_rate(&self) -> Option<f64> {
@@ -338,8 +257,8 @@ impl Finetuning {
 
     fn progress(&self) -> OnlineProgress<'static> {
         OnlineProgress {
-            updates: self.state.updates,
-            policy_steps: self.state.policy_steps,
+            updates: self.core.state.updates,
+            policy_steps: self.core.state.policy_steps,
             line: None,
             evaluation: None,
             episode: None,
@@ -351,10 +270,63 @@ impl Finetuning {
 /// Name of the stage in which the policy acts.
 const ONLINE: &str = "online";
 
-/// What updates take from.
-struct Learning {
-    batches: Prefetch,
-    interval: Interval,
+/// What such a run starts from.
+fn begin(
+    settings: &TrainingSettings,
+    source: Option<&Checkpoint>,
+    device: &Device,
+) -> Result<Parameters, TrainingError> {
+    match source {
+        Some(source) => Ok(start_from(source, &settings.reset, settings.seed, device)?),
+        None => Ok(agent::initialise(&settings.model, settings.seed, device)?),
+    }
+}
+
+impl Updates for Finetuning {
+    fn core(&mut self) -> &mut Core {
+        &mut self.core
+    }
+
+    fn update(&mut self) -> Result<Updated, TrainingError> {
+        let Self { core: Core { settings, state, interval, .. }, batches, updates, .. } = self;
+        let batches = batches.as_mut().expect("a run that goes on has them");
+        let batch = interval.time(TimeBucket::WaitingForBatches, || batches.next_batch())?;
+        let warm_up = state.updates < settings.finetune.warm_up_updates;
+        let numbered = (settings.seed, state.updates);
+        let (world, behaviour) =
+            interval.time(TimeBucket::Learning, || updates.update(batch, numbered, !warm_up))?;
+        let mut values = json!({"losses": world.losses, "gradient_norm": world.gradient_norm});
+        if let Some(behaviour) = behaviour {
+            values["behaviour"] = json!(behaviour);
+        }
+        interval.update(&values);
+        Ok((if warm_up { "warm_up" } else { ONLINE }, None))
+    }
+
+    /// It is the best if the newest episodes had the highest success rate of all checkpoints, the first of equals.
+    fn save(&mut self) -> Result<Option<HeldOutLosses>, TrainingError> {
+        self.write_back()?;
+        let full = self.newest.len() == self.core.settings.finetune.success_episodes;
+        let success = self.success_rate().filter(|_| full);
+        let Self { core, updates, .. } = self;
+        core.state.return_range = updates.return_range();
+        let is_best = success.is_some_and(|rate| core.state.best_success.is_none_or(|best| rate > best));
+        if is_best {
+            core.state.best_success = success;
+        }
+        let adams = updates.adams(&core.parameters)?;
+        let optimisers: Vec<_> = OPTIMISERS.into_iter().zip(&adams).collect();
+        let agent = core.agent()?;
+        core.write(&agent, &optimisers, is_best.into(), core.settings.finetune.warm_up_updates)?;
+        Ok(None)
+    }
+
+    fn tell(&mut self, line: &mut Line) {
+        line.set("policy_steps", self.core.state.policy_steps as f64);
+        line.set("environment_steps", (ACTION_REPEAT * self.core.state.policy_steps) as f64);
+        line.set("refused_actions", self.refused_actions as f64);
+        self.success_rate().into_iter().for_each(|rate| line.set("success_rate", rate));
+    }
 }
 
 /// Refuses a model with a number that is not finite.

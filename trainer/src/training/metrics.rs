@@ -3,23 +3,6 @@ use serde_json::Value;
 
 use crate::learning::LossValues;
 
-/// One line of metrics: means over the updates since the line before.
-#[derive(Debug, Clone, PartialEq, Serialize)]
-pub struct Metrics {
-    /// Updates made so far.
-    pub update: u64,
-    /// `warm_up` or `mask_free`.
-    pub phase: &'static str,
-    /// The losses before their factors.
-    pub losses: LossValues,
-    /// Norm of the gradients before clipping.
-    pub gradient_norm: f64,
-    /// Updates a second.
-    pub updates_per_second: f64,
-    /// Share of the time spent waiting for batches.
-    pub waiting_share: f64,
-}
-
 /// The line of a checkpoint: mask-free losses on the held-out episodes, by the same batches and the same noise every time.
 #[derive(Debug, Clone, PartialEq, Serialize)]
 pub struct HeldOutLosses {

@@ -22,6 +22,7 @@
 //! | `settings` | what can be chosen, presets |
 //! | `state` | what a checkpoint holds beside the weights |
 //! | `run` | the folder: settings, metrics, checkpoints |
+//! | `update_loop` | what all phases do alike: updates, lines of metrics, checkpoints |
 //! | `weight_average` | what checkpoints hold of the weights |
 //! | `metrics` | what a line of metrics says |
 //! | `tensorboard` | event files |
@@ -54,6 +55,7 @@ mod run;
 mod settings;
 mod state;
 mod tensorboard;
+mod update_loop;
 mod weight_average;
 
 pub use averages::{Averages, Interval, Line, TimeBucket};
@@ -64,15 +66,16 @@ pub use evaluations::{EvaluationFacts, EvaluationLine};
 pub use fewshot::{Fewshot, Stage};
 pub use film::film;
 pub use finetune::Finetuning;
-pub use metrics::{HeldOutLosses, Metrics};
+pub use metrics::HeldOutLosses;
 pub use online::{EpisodeFacts, EpisodeLine, OnlineOutcome, OnlineProgress};
 pub use phases::{EvaluationSettings, FewshotSettings, FinetuneSettings, Phase};
 pub use prefill::{Prefilled, episodes_folder, prefill};
-pub use pretrain::{Outcome, Pretraining, Progress};
+pub use pretrain::Pretraining;
 pub use reset::{Reset, ResetSettings, start_from};
 pub use run::{Best, Run};
 pub use settings::{FilmSettings, PretrainSettings, ReplaySettings, TrainingSettings};
 pub use state::{StateError, TrainingState};
+pub use update_loop::{Outcome, Progress};
 
 use crate::acting::FleetError;
 use crate::checkpoint::CheckpointError;

@@ -12,8 +12,8 @@ impl Finetuning {
     ) -> Result<(), TrainingError> {
         let going_on: Vec<_> = gathered.iter().filter(|one| !one.is_last()).collect();
         let seen: Vec<_> = going_on.iter().map(|one| one.seen()).collect();
-        let number = noise_number(self.state.policy_steps, gathered.iter().all(Gathered::is_first));
-        let mut sampler = Sampler::numbered(self.settings.seed ^ ACTING_STREAM, number);
+        let number = noise_number(self.core.state.policy_steps, gathered.iter().all(Gathered::is_first));
+        let mut sampler = Sampler::numbered(self.core.settings.seed ^ ACTING_STREAM, number);
         let decisions = policy.decide(&seen, &mut sampler)?;
         for (one, decision) in going_on.into_iter().zip(&decisions) {
             fleet.answer(one, decision.action)?;
@@ -21,11 +21,11 @@ impl Finetuning {
         for one in gathered.iter().filter(|one| one.is_last()) {
             fleet.answer(one, [0.0; rcwm_models::ACTION_LEN])?;
         }
-        self.state.policy_steps += gathered.iter().filter(|one| !one.is_first()).count() as u64;
+        self.core.state.policy_steps += gathered.iter().filter(|one| !one.is_first()).count() as u64;
         let refused = decisions.iter().filter(|decision| decision.refused).count() as u64;
         self.refused_actions += refused;
         if refused > 0 {
-            check_finite(&self.parameters)?;
+            check_finite(&self.core.parameters)?;
         }
         Ok(())
     }
@@ -33,24 +33,22 @@ impl Finetuning {
     /// Makes the evaluation that is due.
     pub(super) fn evaluate(
         &mut self,
-        learning: &mut Learning,
         stop: &AtomicBool,
         show: &mut impl FnMut(&OnlineProgress<'_>),
     ) -> Result<(), TrainingError> {
-        let due = self.settings.finetune.evaluation.due(self.state.policy_steps);
+        let due = self.core.settings.finetune.evaluation.due(self.core.state.policy_steps);
         if due <= self.evaluations || stop.load(Ordering::Relaxed) {
             return Ok(());
         }
         self.write_back()?;
-        let agent = Agent::new(&self.parameters.frozen(), &self.settings.model)?;
-        let steps = (self.state.policy_steps, ACTION_REPEAT * self.state.policy_steps);
-        let found = learning
-            .interval
-            .time(TimeBucket::Evaluating, || evaluate(agent, &self.settings, steps, stop))?;
+        let agent = Agent::new(&self.core.parameters.frozen(), &self.core.settings.model)?;
+        let steps = (self.core.state.policy_steps, ACTION_REPEAT * self.core.state.policy_steps);
+        let Core { settings, interval, .. } = &mut self.core;
+        let found = interval.time(TimeBucket::Evaluating, || evaluate(agent, settings, steps, stop))?;
         if let Some(evaluation) = found {
             self.evaluations = due;
-            let line = EvaluationLine { update: self.state.updates, phase: ONLINE, evaluation };
-            self.run.log(&line)?;
+            let line = EvaluationLine { update: self.core.state.updates, phase: ONLINE, evaluation };
+            self.core.run.log(&line)?;
             show(&OnlineProgress { evaluation: Some(&line), ..self.progress() });
         }
         Ok(())
@@ -64,40 +62,41 @@ impl Finetuning {
         show: &mut impl FnMut(&OnlineProgress<'_>),
     ) -> Result<(), TrainingError> {
         let Recorded { simulator, episode } = recorded;
-        let path = policy_episode(&self.folder, &self.settings.task, self.state.policy_steps, simulator);
+        let path =
+            policy_episode(&self.folder, &self.core.settings.task, self.core.state.policy_steps, simulator);
         if let Some(folder) = path.parent() {
             std::fs::create_dir_all(folder)
                 .map_err(|source| TrainingError::Folder { path: folder.to_path_buf(), source })?;
         }
         episode.write(&path)?;
-        self.state.episodes += 1;
+        self.core.state.episodes += 1;
         self.newest.push_back(episode.succeeded());
-        if self.newest.len() > self.settings.finetune.success_episodes {
+        if self.newest.len() > self.core.settings.finetune.success_episodes {
             self.newest.pop_front();
         }
         let facts = EpisodeFacts {
-            number: self.state.episodes,
+            number: self.core.state.episodes,
             simulator,
             success: episode.succeeded(),
             total_reward: episode.total_reward(),
             steps: episode.len() as u64 - 1,
-            policy_steps: self.state.policy_steps,
-            environment_steps: ACTION_REPEAT * self.state.policy_steps,
+            policy_steps: self.core.state.policy_steps,
+            environment_steps: ACTION_REPEAT * self.core.state.policy_steps,
         };
-        replay.add(&self.settings.task, episode)?;
-        let line = EpisodeLine { update: self.state.updates, phase: ONLINE, episode: facts };
-        self.run.log(&line)?;
+        replay.add(&self.core.settings.task, episode)?;
+        let line = EpisodeLine { update: self.core.state.updates, phase: ONLINE, episode: facts };
+        self.core.run.log(&line)?;
         show(&OnlineProgress { episode: Some(&line), ..self.progress() });
         Ok(())
     }
 
     /// What simulators are to run: new layouts, also after a run was resumed.
     pub(super) fn launches(&self) -> Vec<Launch> {
-        let finetune = &self.settings.finetune;
+        let finetune = &self.core.settings.finetune;
         let launch = |index: usize| {
-            let instance = format!("{}-{}-{index}", self.settings.phase.verb(), std::process::id());
-            let first = FIRST_EPISODE + index as u64 * EPISODES_A_SIMULATOR + self.state.episodes;
-            let usual = Launch::remote(&self.settings.task, &instance, self.settings.seed);
+            let instance = format!("{}-{}-{index}", self.core.settings.phase.verb(), std::process::id());
+            let first = FIRST_EPISODE + index as u64 * EPISODES_A_SIMULATOR + self.core.state.episodes;
+            let usual = Launch::remote(&self.core.settings.task, &instance, self.core.settings.seed);
             let evaluation = &finetune.evaluation;
             let evaluated = if evaluation.every_steps > 0 { evaluation.episodes } else { 0 };
             Launch {
