@@ -14,16 +14,10 @@ use sha2::{Digest, Sha256};
 pub enum FileError {
     /// The file could not be opened, read, written or renamed.
     #[error("{path}: {source}")]
-    Io {
-        /// The file.
-        path: PathBuf,
-        /// What the operating system said.
-        source: io::Error,
-    },
+    Io { path: PathBuf, source: io::Error },
     /// The file is larger than this kind of file may be.
     #[error("{path} holds {found} bytes, at most {limit} are accepted for this kind of file")]
     TooLarge {
-        /// The file.
         path: PathBuf,
         /// Its size in bytes.
         found: u64,
@@ -32,24 +26,17 @@ pub enum FileError {
     },
     /// The path names something that is not a plain file.
     #[error("{path} is not a plain file (it is a folder, a device or a pipe)")]
-    NotAFile {
-        /// The path.
-        path: PathBuf,
-    },
+    NotAFile { path: PathBuf },
     /// The file that is to be replaced is of another kind.
     #[error("{path} holds something else than {expected}, which would be lost; choose another file")]
     OtherKind {
-        /// The file.
         path: PathBuf,
         /// What is to be written.
         expected: Output,
     },
     /// The file is there and must not be written over.
     #[error("{path} exists already and is not written over; remove it, or choose another place")]
-    Exists {
-        /// The file.
-        path: PathBuf,
-    },
+    Exists { path: PathBuf },
 }
 
 /// What a verb writes where it is told to.

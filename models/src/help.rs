@@ -10,13 +10,28 @@ pub fn examples(text: &str, program: &str) -> Vec<Vec<String>> {
     commands.map(|line| words(line.split("  (").next().unwrap_or(line))).collect()
 }
 
-/// Words as a shell splits them: by spaces outside of double quotes; a `&` at the end is none.
+/// The documents of the project, whose commands are examples, too: every Markdown file at the root, in `docs` and in `benches`.
+fn documents(root: &std::path::Path) -> std::io::Result<Vec<String>> {
+    let mut texts = Vec::new();
+    for folder in [root.to_path_buf(), root.join("docs"), root.join("benches")] {
+        for entry in std::fs::read_dir(folder)? {
+            let path = entry?.path();
+            if path.extension().is_some_and(|ending| ending == "md") {
+                texts.push(std::fs::read_to_string(path)?);
+            }
+        }
+    }
+    Ok(texts)
+}
+
+/// Words as a shell splits them: by spaces outside of double quotes; a `&` at the end is none, nor is a remark behind ` #`.
 fn words(line: &str) -> Vec<String> {
     let (mut words, mut word, mut quoted) = (Vec::new(), String::new(), false);
     for letter in line.chars() {
         match letter {
             '"' => quoted = !quoted,
             ' ' if !quoted => words.push(std::mem::take(&mut word)),
+            '#' if !quoted && word.is_empty() => break,
             letter => word.push(letter),
         }
     }
@@ -25,7 +40,7 @@ fn words(line: &str) -> Vec<String> {
     words
 }
 
-/// What is wrong with the examples of `program` in help texts: those that `parse` refuses, and those that name a shipped file that is not
+/// What is wrong with the examples of `program` in help texts and in the documents of the project at `root`: those that `parse` refuses, and those that name a shipped file that is not
 /// there below `root`. Also how many there are.
 ///
 /// # Errors
@@ -36,7 +51,8 @@ pub fn check_examples(
     root: &std::path::Path,
     parse: impl Fn(&[String]) -> Result<(), String>,
 ) -> Result<usize, String> {
-    let all: Vec<_> = texts.iter().flat_map(|text| examples(text, program)).collect();
+    let documents = documents(root).map_err(|error| format!("documents: {error}"))?;
+    let all: Vec<_> = texts.iter().chain(&documents).flat_map(|text| examples(text, program)).collect();
     for example in &all {
         parse(example).map_err(|reason| format!("{example:?}: {reason}"))?;
         if let Some(missing) = missing_file(example, root) {
@@ -63,6 +79,11 @@ mod tests {
         let text = "Examples:\n  tool go --a 1 \\\n      --b \"x y=z\" &\n  other go\n  tool stop        (when it is enough)\n\nMore.";
         let expected = [vec!["tool", "go", "--a", "1", "--b", "x y=z"], vec!["tool", "stop"]];
         assert_eq!(examples(text, "tool"), expected);
+    }
+
+    #[test]
+    fn remarks_are_no_words() {
+        assert_eq!(words("tool run --a b#c &    # beside `x`"), ["tool", "run", "--a", "b#c"]);
     }
 
     #[test]

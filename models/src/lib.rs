@@ -13,6 +13,7 @@
 //! | [`files`] | atomic writes, checksums, capped reads |
 //! | [`help`] | the examples of a help text |
 //! | [`lock`] | one writer a folder |
+//! | `picture` | PNG files (feature `pictures`) |
 //! | [`programs`] | where the programs that start one another are |
 //! | [`progress`] | how far a long work is, on a terminal or by lines |
 //! | [`terminal`] | printing that survives a closed pipe and a full disk; lines of progress without a terminal |
@@ -26,6 +27,8 @@ pub mod files;
 pub mod help;
 pub mod lock;
 pub mod onnx;
+#[cfg(feature = "pictures")]
+pub mod picture;
 pub mod programs;
 pub mod progress;
 pub mod settings;

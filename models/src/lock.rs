@@ -27,7 +27,6 @@ pub enum LockError {
     Io {
         /// What was to be locked.
         path: PathBuf,
-        /// What the operating system said.
         source: io::Error,
     },
 }

@@ -43,13 +43,11 @@ pub struct Model {
     /// Program that wrote it.
     #[prost(string, tag = "2")]
     pub producer_name: String,
-    /// Its version.
     #[prost(string, tag = "3")]
     pub producer_version: String,
     /// What the model is.
     #[prost(string, tag = "6")]
     pub doc_string: String,
-    /// The graph.
     #[prost(message, optional, tag = "7")]
     pub graph: Option<Graph>,
     /// Operator sets used.
@@ -64,13 +62,11 @@ pub struct Model {
 #[derive(Clone, PartialEq, Message)]
 pub struct Opaque {}
 
-/// An operator set.
 #[derive(Clone, PartialEq, Message)]
 pub struct OperatorSet {
     /// Empty for the standard operators.
     #[prost(string, tag = "1")]
     pub domain: String,
-    /// Its version.
     #[prost(int64, tag = "2")]
     pub version: i64,
 }
@@ -90,10 +86,8 @@ pub struct Graph {
     /// What the graph does.
     #[prost(string, tag = "10")]
     pub doc_string: String,
-    /// Inputs.
     #[prost(message, repeated, tag = "11")]
     pub input: Vec<ValueInfo>,
-    /// Outputs.
     #[prost(message, repeated, tag = "12")]
     pub output: Vec<ValueInfo>,
     /// Types of values in between.
@@ -130,7 +124,6 @@ pub struct Node {
 /// An attribute of a node.
 #[derive(Clone, PartialEq, Message)]
 pub struct Attribute {
-    /// Name.
     #[prost(string, tag = "1")]
     pub name: String,
     /// A float.
@@ -142,7 +135,6 @@ pub struct Attribute {
     /// Bytes.
     #[prost(bytes = "vec", tag = "4")]
     pub s: Vec<u8>,
-    /// A tensor.
     #[prost(message, optional, tag = "5")]
     pub t: Option<Tensor>,
     /// A graph (control flow); we accept none.
@@ -168,7 +160,6 @@ pub struct Tensor {
     /// See [`data_type`].
     #[prost(int32, tag = "2")]
     pub data_type: i32,
-    /// Name.
     #[prost(string, tag = "8")]
     pub name: String,
     /// Little-endian contents.
@@ -204,10 +195,8 @@ impl Tensor {
 /// Name and type of a value.
 #[derive(Clone, PartialEq, Message)]
 pub struct ValueInfo {
-    /// Name.
     #[prost(string, tag = "1")]
     pub name: String,
-    /// Type.
     #[prost(message, optional, tag = "2")]
     pub r#type: Option<Type>,
 }
@@ -239,7 +228,6 @@ pub struct Type {
     pub tensor_type: Option<TensorType>,
 }
 
-/// Type of a tensor.
 #[derive(Clone, PartialEq, Message)]
 pub struct TensorType {
     /// See [`data_type`].
@@ -250,7 +238,6 @@ pub struct TensorType {
     pub shape: Option<Shape>,
 }
 
-/// A shape.
 #[derive(Clone, PartialEq, Message)]
 pub struct Shape {
     /// Dimensions.

@@ -17,7 +17,6 @@ pub enum Values {
 }
 
 impl Values {
-    /// The shape.
     #[must_use]
     pub fn shape(&self) -> &[usize] {
         match self {
@@ -78,7 +77,6 @@ pub enum TensorsError {
     Unexpected {
         /// The tensor.
         name: String,
-        /// What it is.
         found: String,
         /// What it must be.
         expected: String,

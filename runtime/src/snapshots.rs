@@ -30,18 +30,10 @@ pub struct SnapshotSettings {
 pub enum SnapshotError {
     /// The file could not be opened or written.
     #[error("telemetry {path}: {source}")]
-    Io {
-        /// The file.
-        path: PathBuf,
-        /// What the operating system said.
-        source: std::io::Error,
-    },
+    Io { path: PathBuf, source: std::io::Error },
     /// Another run appends to the file.
     #[error("telemetry {path} is in use: another run appends to it; name another file")]
-    InUse {
-        /// The file.
-        path: PathBuf,
-    },
+    InUse { path: PathBuf },
 }
 
 /// Statistics of one branch's surprise, in nats.

@@ -37,22 +37,13 @@ pub enum CheckpointError {
     File(#[from] FileError),
     /// The folder could not be made.
     #[error("checkpoint: {path}: {source}")]
-    Folder {
-        /// The folder.
-        path: PathBuf,
-        /// What the operating system said.
-        source: std::io::Error,
-    },
+    Folder { path: PathBuf, source: std::io::Error },
     /// The folder holds a checkpoint already.
     #[error("checkpoint: {path} holds a checkpoint already; choose another folder or say --force")]
-    Exists {
-        /// The folder.
-        path: PathBuf,
-    },
+    Exists { path: PathBuf },
     /// There is none at the path, and none of a run either.
     #[error("checkpoint: {path}: {reason}")]
     NoCheckpoint {
-        /// The path.
         path: PathBuf,
         /// What is there, and what was expected.
         reason: String,

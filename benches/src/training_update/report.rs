@@ -123,7 +123,6 @@ impl Report {
         );
     }
 
-    /// Its heading.
     pub fn print_heading() {
         rcwm_models::outln!("growth of the small update, one size changed at a time");
         rcwm_models::outln!(

@@ -28,7 +28,6 @@ pub enum BundleError {
     Manifest {
         /// The manifest.
         path: PathBuf,
-        /// What is wrong with it.
         reason: String,
     },
     /// The bundle was written for another version.
@@ -44,20 +43,15 @@ pub enum BundleError {
     Settings(#[from] SettingsError),
     /// A file name points out of the folder.
     #[error("bundle: file name {name:?} is not a plain name inside the bundle")]
-    OutsidePath {
-        /// The name.
-        name: String,
-    },
+    OutsidePath { name: String },
     /// A file is not the one that was exported.
     #[error(
         "bundle: {file}: {what} is {found}, the manifest says {expected}; copy or export the bundle again"
     )]
     Mismatch {
-        /// The file.
         file: String,
         /// `size` or `sha256`.
         what: &'static str,
-        /// What it is.
         found: String,
         /// What it must be.
         expected: String,
@@ -65,23 +59,16 @@ pub enum BundleError {
     /// A part that every policy needs is not listed, or one is listed twice.
     #[error("bundle: part {part} is {problem}")]
     Part {
-        /// The part.
         part: PartName,
         /// `missing` or `listed twice`.
         problem: &'static str,
     },
     /// A part is not the ONNX this runtime runs.
     #[error("bundle: {part}: {source}")]
-    Onnx {
-        /// The part.
-        part: PartName,
-        /// What is wrong.
-        source: OnnxError,
-    },
+    Onnx { part: PartName, source: OnnxError },
     /// A part's graph does something that it must not.
     #[error("bundle: {part}: {source}; export it again with the matching trainer")]
     Graph {
-        /// The part.
         part: PartName,
         /// What it does.
         source: GraphError,
@@ -89,7 +76,6 @@ pub enum BundleError {
     /// A part's inputs or outputs are not those of the contract.
     #[error("bundle: {part}: {role} are {found}, expected {expected}")]
     Signature {
-        /// The part.
         part: PartName,
         /// `inputs` or `outputs`, of the manifest or of the graph.
         role: &'static str,
@@ -100,12 +86,7 @@ pub enum BundleError {
     },
     /// Initial states or golden values are unusable.
     #[error("bundle: {file}: {source}")]
-    Tensors {
-        /// The file.
-        file: String,
-        /// What is wrong.
-        source: TensorsError,
-    },
+    Tensors { file: String, source: TensorsError },
     /// A value is out of its range.
     #[error("bundle: {0}")]
     Invalid(String),
@@ -129,11 +110,9 @@ pub struct InitialState {
 pub struct Bundle {
     /// The folder it came from.
     pub folder: PathBuf,
-    /// The manifest.
     pub manifest: Manifest,
     /// The ONNX files' bytes, without what the checks do not know: an engine sees nothing that was not checked.
     pub parts: BTreeMap<PartName, Vec<u8>>,
-    /// The initial state.
     pub initial: InitialState,
     /// Golden inputs and outputs, see [`super`].
     pub golden: Tensors,

@@ -96,7 +96,6 @@ pub struct FileEntry {
 #[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct PartEntry {
-    /// Which part.
     pub name: PartName,
     /// Plain file name inside the folder.
     pub file: String,

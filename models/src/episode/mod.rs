@@ -65,18 +65,12 @@ pub enum EpisodeError {
     File(#[from] FileError),
     /// Not an archive of arrays, or a damaged one.
     #[error("episode {path}: {reason}")]
-    Archive {
-        /// The file.
-        path: PathBuf,
-        /// What is wrong.
-        reason: String,
-    },
+    Archive { path: PathBuf, reason: String },
     /// An array is missing.
     #[error(
         "episode {path}: array {key:?} is missing; expected Dreamer's keys (image, action, reward, is_first, ...)"
     )]
     Missing {
-        /// The file.
         path: PathBuf,
         /// The array's name.
         key: &'static str,
@@ -84,11 +78,9 @@ pub enum EpisodeError {
     /// An array has another type or shape than it must have.
     #[error("episode {path}: array {key:?} is {found}, expected {expected}")]
     Array {
-        /// The file.
         path: PathBuf,
         /// The array's name.
         key: &'static str,
-        /// What it is.
         found: String,
         /// What it must be.
         expected: String,

@@ -16,9 +16,7 @@ impl Amounts {
     pub const CONSTANTS: usize = 1024;
     /// Inputs of a node, and as many outputs.
     pub const NODE_INPUTS: usize = 16;
-    /// Attributes of a node.
     pub const NODE_ATTRIBUTES: usize = 16;
-    /// Bytes of a name.
     pub const NAME_BYTES: usize = 256;
 
     /// Counts what a file holds.

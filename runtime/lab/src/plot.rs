@@ -4,8 +4,6 @@ use std::path::Path;
 use std::sync::OnceLock;
 
 use hdrhistogram::Histogram;
-use image::RgbImage;
-use image::codecs::png::{CompressionType, FilterType, PngEncoder};
 use plotters::coord::Shift;
 use plotters::coord::types::RangedCoordf64;
 use plotters::prelude::*;
@@ -13,6 +11,8 @@ use plotters::style::register_font;
 use plotters::style::text_anchor::{HPos, Pos, VPos};
 use rcwm_models::files::{FileError, read_capped};
 use rcwm_runtime::telemetry::{LatencyFiles, Stage, Telemetry};
+
+use rcwm_models::picture::{PictureError, write_png};
 
 /// DejaVu Sans, the glyphs that are used; its licence lies beside it.
 const FONT: &[u8] = include_bytes!("DejaVuSans-subset.ttf");
@@ -49,14 +49,10 @@ const COLOURS: [RGBColor; 13] = [
 pub enum PlotError {
     /// There is nothing to draw.
     #[error("plot {path}: no latency was recorded")]
-    Empty {
-        /// The file.
-        path: std::path::PathBuf,
-    },
+    Empty { path: std::path::PathBuf },
     /// It is no percentile file.
     #[error("{path} holds no latencies: {reason}; expected a percentile file, as --hgrm writes it")]
     NoLatencies {
-        /// The file.
         path: std::path::PathBuf,
         /// What was found.
         reason: String,
@@ -64,9 +60,9 @@ pub enum PlotError {
     /// Drawing failed.
     #[error("plot: {0}")]
     Draw(String),
-    /// The picture could not be packed.
+    /// The picture could not be written.
     #[error("plot: {0}")]
-    Picture(#[from] image::ImageError),
+    Picture(#[from] PictureError),
     /// A file could not be written.
     #[error("latencies: {0}")]
     File(#[from] FileError),
@@ -154,17 +150,14 @@ pub fn plot(path: &Path, title: &str, curves: &[Curve], period_us: Option<f64>) 
     if lines.is_empty() {
         return Err(PlotError::Empty { path: path.to_path_buf() });
     }
-    let mut picture = RgbImage::new(SIZE.0, SIZE.1);
+    let mut picture = vec![0; 3 * (SIZE.0 * SIZE.1) as usize];
     {
         let area = BitMapBackend::with_buffer(&mut picture, SIZE).into_drawing_area();
         draw(&area, title, &lines, period_us.map(place_us))
             .and_then(|()| area.present())
             .map_err(|error| PlotError::Draw(error.to_string()))?;
     }
-    let mut bytes = Vec::new();
-    let encoder = PngEncoder::new_with_quality(&mut bytes, CompressionType::Best, FilterType::Adaptive);
-    picture.write_with_encoder(encoder)?;
-    Ok(rcwm_models::files::write_atomic(path, &bytes)?)
+    Ok(write_png(path, [SIZE.0, SIZE.1], &picture)?)
 }
 
 /// A curve at its places on the axes.

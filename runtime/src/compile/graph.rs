@@ -10,18 +10,15 @@ use rcwm_models::onnx::{Attribute, Node, Tensor, attribute_type, data_type};
 pub struct Fact {
     /// See [`data_type`].
     pub dtype: i32,
-    /// The shape.
     pub shape: Vec<usize>,
 }
 
 /// A node, the part it comes from, and whether it depends on the image.
 #[derive(Debug, Clone, PartialEq)]
 pub struct TickNode {
-    /// The part.
     pub part: PartName,
     /// Whether it depends on the image.
     pub late: bool,
-    /// The node.
     pub node: Node,
 }
 
@@ -70,7 +67,6 @@ impl Graph {
         self.floats(value).filter(|values| values.len() == 1).map(|values| values[0])
     }
 
-    /// Shape of a constant.
     pub fn constant_shape(&self, value: &str) -> Option<Vec<usize>> {
         self.constants.get(value)?.dims.iter().map(|dim| usize::try_from(*dim).ok()).collect()
     }
@@ -113,7 +109,6 @@ impl Graph {
     }
 }
 
-/// An attribute of a node.
 pub fn attribute<'a>(node: &'a Node, name: &str) -> Option<&'a Attribute> {
     node.attribute.iter().find(|attribute| attribute.name == name)
 }

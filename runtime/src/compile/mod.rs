@@ -56,7 +56,6 @@ pub struct Optimizations {
 impl Optimizations {
     /// All that keep the results as they are (up to rounding).
     pub const EXACT: Self = Self { norms: true, convolutions: true, layers: true, half_weights: false };
-    /// None.
     pub const NONE: Self = Self { norms: false, convolutions: false, layers: false, half_weights: false };
 }
 
@@ -73,12 +72,7 @@ pub enum CompileError {
     #[error(
         "compiling {part}: {reason}; export the bundle again, or run its parts as they are with --engine ort"
     )]
-    Part {
-        /// The part.
-        part: PartName,
-        /// What is wrong.
-        reason: String,
-    },
+    Part { part: PartName, reason: String },
 }
 
 /// The segments of a bundle's tick, in the order they run.

@@ -20,7 +20,6 @@ impl Graph {
         &self.nodes[index].node.input
     }
 
-    /// The operator.
     pub(super) fn operator(&self, index: usize) -> &str {
         &self.nodes[index].node.op_type
     }

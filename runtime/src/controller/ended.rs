@@ -16,7 +16,6 @@ pub enum ControllerError {
          (same user, same RCWM_PREFIX), or wait longer with --timeout"
     )]
     NoObservation {
-        /// The instance.
         instance: String,
         /// How long was waited, in s.
         timeout_s: f64,
@@ -39,7 +38,6 @@ pub enum ControllerError {
          --silence-max"
     )]
     PeerLost {
-        /// The instance.
         instance: String,
         /// The limit, in s.
         silence_s: f64,

@@ -4,12 +4,10 @@ use rcwm_models::tasks::task_name;
 use rcwm_models::wire::{Observation, ObservationFlags};
 use serde::Serialize;
 
-/// One episode.
 #[derive(Debug, Clone, Copy, PartialEq, Serialize)]
 pub struct EpisodeResult {
     /// Its number at the simulator.
     pub episode: u64,
-    /// Its task.
     pub task: &'static str,
     /// Step of the last observation received; the first of an episode is step 0.
     pub steps: u32,

@@ -86,7 +86,6 @@ pub enum Response {
     Imagine,
     /// The fallback action.
     Fallback,
-    /// Nothing.
     Nothing,
 }
 

@@ -115,7 +115,6 @@ impl std::fmt::Display for Pace {
 /// A run, as printed and as written with `--json`.
 #[derive(Debug, Clone, PartialEq, Serialize)]
 pub struct RunReport {
-    /// Task of the bundle.
     pub bundle_task: String,
     /// Preset of the bundle.
     pub preset: String,

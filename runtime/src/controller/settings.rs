@@ -10,7 +10,6 @@ use crate::pacing::PacingSettings;
 /// How the loop runs.
 #[derive(Debug, Clone)]
 pub struct ControllerSettings {
-    /// The link.
     pub link: LinkSettings,
     /// Ends after this many whole episodes.
     pub episodes_max: Option<u64>,

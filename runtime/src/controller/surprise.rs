@@ -52,9 +52,7 @@ pub struct BranchSurprise {
 pub struct SurpriseReport {
     /// How many ticks.
     pub count: u64,
-    /// Robot branch.
     pub robot: BranchSurprise,
-    /// Environment branch.
     pub environment: BranchSurprise,
 }
 

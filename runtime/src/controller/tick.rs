@@ -35,7 +35,6 @@ pub struct Tick<'a> {
     pub overtaken: bool,
     /// What the controller is up to after the tick.
     pub state: State,
-    /// Times of the tick.
     pub times: TickTimes,
     /// The policy after the tick; its state is that of the last good tick where the answer is a fallback.
     pub policy: &'a Policy,

@@ -9,7 +9,6 @@ use rcwm_models::bundle::{DType, TensorSpec};
 
 type State = TypedSimpleState;
 
-/// A part in tract.
 pub(super) struct TractPart {
     contract: TensorContract,
     state: State,

@@ -33,22 +33,13 @@ use std::path::PathBuf;
 pub enum LogError {
     /// The file could not be opened, read or written.
     #[error("log {path}: {source}")]
-    Io {
-        /// The file.
-        path: PathBuf,
-        /// What the operating system said.
-        source: std::io::Error,
-    },
+    Io { path: PathBuf, source: std::io::Error },
     /// A log is never written over.
     #[error("log {path} exists already; name another file, or remove it")]
-    Exists {
-        /// The file.
-        path: PathBuf,
-    },
+    Exists { path: PathBuf },
     /// It is no log.
     #[error("{path} is no log: {reason}; expected a file written by `rcwm-runtime run --log`")]
     NotALog {
-        /// The file.
         path: PathBuf,
         /// What was found.
         reason: String,
@@ -58,21 +49,17 @@ pub enum LogError {
         "log {path} has version {found}, this program reads version {expected}; use the program that wrote it"
     )]
     Version {
-        /// The file.
         path: PathBuf,
         /// Its version.
         found: u32,
-        /// Ours.
         expected: u32,
     },
     /// It was cut or changed.
     #[error("log {path} is damaged at byte {offset}: {reason}; the {ticks} ticks before it are sound")]
     Damaged {
-        /// The file.
         path: PathBuf,
         /// Where the broken frame begins.
         offset: u64,
-        /// What is wrong.
         reason: String,
         /// Ticks read before it.
         ticks: u64,

@@ -14,7 +14,6 @@ pub struct PackedImage {
     lz4: Vec<u8>,
 }
 
-/// A packed mask.
 #[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
 pub struct PackedMask {
     lz4: Vec<u8>,

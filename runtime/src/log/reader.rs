@@ -15,7 +15,6 @@ use super::record::{BundleIdentity, Header, Record, TickRecord, VERSION};
 /// What a log holds, one after another.
 #[derive(Debug)]
 pub enum Entry {
-    /// A tick.
     Tick(Box<LoggedTick>),
     /// From here on another policy ran.
     Policy(BundleIdentity),

@@ -30,9 +30,7 @@ pub struct Header {
     pub started_unix_s: u64,
     /// The link's instance.
     pub instance: String,
-    /// The bundle.
     pub bundle: BundleIdentity,
-    /// The engine.
     pub engine: EngineSettings,
     /// How latents and actions were chosen, and the seed.
     pub sampling: Sampling,
@@ -70,7 +68,6 @@ pub struct Machine {
 }
 
 impl Machine {
-    /// This one.
     #[must_use]
     pub fn here() -> Self {
         let text = std::fs::read_to_string("/proc/cpuinfo").unwrap_or_default();
@@ -85,9 +82,7 @@ impl Machine {
 /// Which bundle, by content.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 pub struct BundleIdentity {
-    /// Its task.
     pub task: String,
-    /// Its preset.
     pub preset: String,
     /// sha256 of the initial state and of every part, by name.
     pub sha256: Vec<(String, String)>,
@@ -137,20 +132,17 @@ impl BundleIdentity {
 /// One entry after the header.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 pub enum Record {
-    /// A tick.
     Tick(Box<TickRecord>),
     /// From here on another policy ran, from its initial state.
     Policy(BundleIdentity),
     /// The log was finished properly.
     End {
-        /// Ticks in it.
         ticks: u64,
         /// Ticks that were dropped.
         dropped: u64,
     },
 }
 
-/// One tick.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 pub struct TickRecord {
     /// Ticks before it that were dropped because the writer could not keep up.
@@ -289,7 +281,6 @@ pub enum LoggedOutcome {
     StateSet(u32),
     /// A decision was made.
     Decided {
-        /// The action.
         action: [f32; ACTION_LEN],
         /// Work ahead was done again.
         recomputed: bool,

@@ -27,7 +27,6 @@ const FLUSH: Duration = Duration::from_millis(500);
 pub struct LogSettings {
     /// The link's instance.
     pub instance: String,
-    /// The engine.
     pub engine: EngineSettings,
     /// How latents and actions are chosen.
     pub sampling: Sampling,
@@ -51,9 +50,7 @@ impl LogSettings {
 /// What was written.
 #[derive(Debug, Clone, PartialEq, Eq, Default, serde::Serialize)]
 pub struct LogSummary {
-    /// The file.
     pub file: PathBuf,
-    /// Ticks in it.
     pub ticks: u64,
     /// Ticks that were dropped because the writer could not keep up.
     pub dropped: u64,

@@ -50,16 +50,13 @@ pub enum CallOutcome {
     },
     /// A part gave something that is not finite, or a class that does not exist.
     NotFinite {
-        /// The part.
         part: PartName,
     },
     /// What was handed over was refused.
     Refused,
-    /// The engine failed.
     EngineFailed,
 }
 
-/// One call.
 #[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
 pub struct Call {
     /// What was asked.

@@ -25,10 +25,5 @@ pub enum PolicyError {
     Observation(String),
     /// A part gave a number that is not finite, or a class that does not exist; the carried state is unchanged.
     #[error("{part} gave a value of {output} that is not finite or not a class")]
-    NotFinite {
-        /// The part.
-        part: PartName,
-        /// Its output.
-        output: &'static str,
-    },
+    NotFinite { part: PartName, output: &'static str },
 }

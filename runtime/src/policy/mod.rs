@@ -79,7 +79,6 @@ pub struct Decision {
 enum Before {
     /// Nothing: it is the first of its episode.
     Start,
-    /// This action.
     Action([f32; ACTION_LEN]),
 }
 

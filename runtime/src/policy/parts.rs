@@ -29,15 +29,12 @@ pub struct BranchBuffers {
 pub struct Buffers {
     /// Features of the shared encoder, `[2c, 16, 16]`; only where the parts run as exported.
     pub features: Vec<f32>,
-    /// Robot branch.
     pub robot: BranchBuffers,
     /// The environment's z as the robot moves it (eq. 7), `[n, m]`.
     pub e: Vec<f32>,
     /// Attention map, `[n, n + k]`.
     pub attention: Vec<f32>,
-    /// Environment branch.
     pub environment: BranchBuffers,
-    /// Mean action.
     pub mean: [f32; ACTION_LEN],
     /// Standard deviation of the action.
     pub std: [f32; ACTION_LEN],

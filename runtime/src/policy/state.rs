@@ -2,7 +2,6 @@
 
 use rcwm_models::bundle::InitialState;
 
-/// State of one branch.
 #[derive(Debug, PartialEq, Default)]
 pub struct BranchState {
     /// Posterior z: n class indices.
@@ -14,9 +13,7 @@ pub struct BranchState {
 /// State of both branches.
 #[derive(Debug, PartialEq, Default)]
 pub struct State {
-    /// Robot branch.
     pub robot: BranchState,
-    /// Environment branch.
     pub environment: BranchState,
 }
 

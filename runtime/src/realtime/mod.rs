@@ -23,7 +23,6 @@ pub struct Request {
 /// One thing that was asked for.
 #[derive(Debug, Clone, PartialEq, Eq, Serialize)]
 pub struct Grant {
-    /// What.
     pub what: String,
     /// Whether it holds, as read back from the system.
     pub granted: bool,

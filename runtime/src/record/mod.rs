@@ -51,7 +51,6 @@ pub struct Recorder<S> {
 /// What a recorder leaves behind.
 #[derive(Debug)]
 pub struct Finished<S> {
-    /// The sink.
     pub sink: S,
     /// Ticks that have no record.
     pub dropped: u64,
@@ -66,7 +65,6 @@ impl<S: Sink> Recorder<S> {
     /// Records that may wait for the writer: half a second at 1 kHz, about 9 MB.
     pub const RECORDS: usize = 512;
 
-    /// Starts the writer.
     pub fn start(policy: &Policy, sink: S) -> Result<Self, WriterLost> {
         Self::with_records(policy, sink, Self::RECORDS)
     }

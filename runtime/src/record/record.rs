@@ -23,7 +23,6 @@ pub struct Record {
     pub is_first: bool,
     /// The answer was not sent.
     pub overtaken: bool,
-    /// Times of the tick.
     pub times: TickTimes,
     /// What was sent.
     pub answer: Action,
@@ -47,7 +46,6 @@ pub struct Record {
     pub ended: Vec<EpisodeResult>,
     /// Whole episodes so far, and the successful ones of them.
     pub whole: [u64; 2],
-    /// The running episode.
     pub running: EpisodeResult,
 }
 

@@ -100,7 +100,6 @@ pub enum SwapError {
     Server {
         /// Name of the socket.
         name: String,
-        /// What the system said.
         source: io::Error,
     },
     /// Nobody answers.
@@ -108,19 +107,13 @@ pub enum SwapError {
         "no run on instance {instance:?} takes swaps: {source}; start `rcwm-runtime run --instance {instance}` (same machine, \
          same RCWM_PREFIX)"
     )]
-    NoServer {
-        /// The instance.
-        instance: String,
-        /// What the system said.
-        source: io::Error,
-    },
+    NoServer { instance: String, source: io::Error },
     /// Somebody else has the server's name.
     #[error(
         "the swap server of instance {instance:?} belongs to user {user}, who is neither you nor root: nothing was asked; start the run and \
          this program as the same user"
     )]
     Stranger {
-        /// The instance.
         instance: String,
         /// The server's user.
         user: u32,

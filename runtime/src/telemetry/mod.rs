@@ -40,7 +40,6 @@ pub enum Stage {
     Interaction,
     /// Environment branch.
     Environment,
-    /// Actor.
     Actor,
     /// Observation received -> action published.
     Tick,

@@ -9,7 +9,6 @@ use rcwm_models::{ACTION_LEN, IMAGE_BYTES};
 use super::VerifyError;
 use crate::policy::State;
 
-/// The branches, as parts.
 pub(super) const BRANCHES: [PartName; 2] = [PartName::Robot, PartName::Environment];
 
 /// Typed access to a bundle's golden values.

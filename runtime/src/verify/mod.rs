@@ -44,12 +44,7 @@ pub const HALF_FLIP_MARGIN_MAX: f32 = 0.1;
 pub enum VerifyError {
     /// A golden value is missing or has the wrong type or size.
     #[error("{file}: {source}; export the bundle again")]
-    Golden {
-        /// The file.
-        file: PathBuf,
-        /// What is wrong.
-        source: TensorsError,
-    },
+    Golden { file: PathBuf, source: TensorsError },
     /// An engine failed.
     #[error(transparent)]
     Engine(#[from] EngineError),
@@ -77,7 +72,6 @@ pub struct OutputError {
 /// A class that is another than the trainer's.
 #[derive(Debug, Clone, PartialEq, Serialize)]
 pub struct Flip {
-    /// The tick.
     pub tick: usize,
     /// `robot` or `environment`.
     pub branch: PartName,
@@ -106,9 +100,7 @@ impl Flip {
 /// One part alone.
 #[derive(Debug, Clone, PartialEq, Serialize)]
 pub struct PartReport {
-    /// The part.
     pub part: PartName,
-    /// Its outputs.
     pub outputs: Vec<OutputError>,
     /// Classes that differ.
     pub flips: Vec<Flip>,
@@ -131,10 +123,8 @@ pub struct RecurrentReport {
     pub flips: Vec<Flip>,
 }
 
-/// One engine.
 #[derive(Debug, Clone, PartialEq, Serialize)]
 pub struct EngineReport {
-    /// The engine.
     pub engine: EngineKind,
     /// Every part of the bundle that has golden values.
     pub parts: Vec<PartReport>,

@@ -17,7 +17,6 @@ const INSTANCE: &str = "fault";
 /// How the controller is started.
 #[derive(Debug, Clone)]
 pub struct ControllerOptions {
-    /// The bundle.
     pub bundle: PathBuf,
     /// `--imagined-ticks-max`.
     pub imagined_ticks_max: u32,

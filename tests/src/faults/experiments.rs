@@ -45,7 +45,6 @@ pub enum Experiment {
 /// What came of an experiment.
 #[derive(Debug, Clone, Serialize)]
 pub struct Outcome {
-    /// Which.
     pub experiment: Experiment,
     /// How often the fault happened.
     pub rounds: usize,

@@ -19,7 +19,6 @@ const ON_THE_WAY_NS: u64 = 1_000_000;
 pub struct Published {
     /// Who published it.
     pub publisher: u128,
-    /// Its sequence.
     pub sequence: u64,
     /// When it was due.
     pub scheduled_ns: u64,
@@ -30,9 +29,7 @@ pub struct Published {
 /// All that went over the wire, each in the order of its time of publication.
 #[derive(Debug, Clone, Default)]
 pub struct Record {
-    /// Observations.
     pub observations: Vec<Published>,
-    /// Actions.
     pub actions: Vec<Action>,
 }
 
@@ -124,11 +121,9 @@ fn look(observations: &ObserverLink, actions: &ActionObserverLink, record: &Mute
 /// An action that came too late.
 #[derive(Debug, Clone, PartialEq, Eq, serde::Serialize)]
 pub struct Stale {
-    /// What it answers.
     pub answers: u64,
     /// The newest observation by then.
     pub newest: u64,
-    /// Its source.
     pub source: u32,
     /// How long after the newest it was published, in us.
     pub after_us: u64,

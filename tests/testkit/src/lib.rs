@@ -1,7 +1,6 @@
 //! A real bundle, changed copies of it, and a real peer on a link of its own.
 
 #![allow(clippy::unwrap_used, reason = "a helper that fails fails its test")]
-#![allow(missing_docs, reason = "names of helpers say what they do")]
 
 pub mod counting;
 

@@ -16,11 +16,9 @@ pub enum Buffer {
 /// A matrix of f32 [rows, cols] whose columns are contiguous and whose rows are `stride` numbers apart.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct Matrix {
-    /// Its buffer.
     pub place: Buffer,
     /// Where it begins in the buffer, in numbers.
     pub offset: usize,
-    /// Rows.
     pub rows: usize,
     /// Columns.
     pub cols: usize,
@@ -84,7 +82,6 @@ impl Matrix {
 /// An argument that is an address; null without a place.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct Pointer {
-    /// The buffer.
     pub place: Option<Buffer>,
     /// Distance from its begin.
     pub bytes: usize,
@@ -110,7 +107,6 @@ impl From<Option<Matrix>> for Pointer {
 /// How a kernel is spread over blocks.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub struct Grid {
-    /// Blocks.
     pub blocks: usize,
     /// Threads of a block.
     pub threads: usize,
@@ -147,12 +143,10 @@ impl Grid {
     }
 }
 
-/// One command.
 #[derive(Debug, Clone, PartialEq)]
 pub enum Command {
     /// A kernel with its arguments.
     Kernel {
-        /// Which.
         kernel: Kernel,
         /// Over what.
         grid: Grid,
@@ -227,7 +221,6 @@ pub enum Lane {
 }
 
 impl Lane {
-    /// The other one.
     #[must_use]
     pub fn other(self) -> Self {
         match self {
@@ -242,7 +235,6 @@ impl Lane {
 pub struct Item {
     /// Which of the program's parts.
     pub part: u16,
-    /// Which lane.
     pub lane: Lane,
     /// What is done.
     pub command: Command,

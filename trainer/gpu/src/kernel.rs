@@ -25,7 +25,6 @@ macro_rules! define {
     ($($variant:ident $name:ident),* $(,)?) => {
         /// A kernel of `kernels/`.
         #[derive(Debug, Clone, Copy, PartialEq, Eq, Hash)]
-        #[allow(missing_docs, reason = "each is described where it is written, in `kernels/`")]
         pub enum Kernel { $($variant),* }
 
         impl Kernel {

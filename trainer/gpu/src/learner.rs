@@ -61,7 +61,6 @@ impl Learner {
         &self.weights
     }
 
-    /// The settings.
     #[must_use]
     pub fn settings(&self) -> &LearnerSettings {
         &self.settings

@@ -17,9 +17,7 @@ pub const RUN: usize = 256;
 pub enum Group {
     /// World model with reward and continuation.
     World,
-    /// Actor.
     Actor,
-    /// Critic.
     Critic,
     /// The critic's slow copy, which lies as the critic does.
     SlowCritic,
@@ -50,7 +48,6 @@ pub struct Entry {
 }
 
 impl Entry {
-    /// Numbers in it.
     #[must_use]
     pub fn numbers(&self) -> usize {
         self.shape.iter().product()
@@ -80,7 +77,6 @@ enum Order {
     },
 }
 
-/// One of the arrays.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Array {
     /// The parameters.

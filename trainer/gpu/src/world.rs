@@ -16,11 +16,9 @@ pub use sizes::Sizes;
 /// What the losses are multiplied with.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct WorldScales {
-    /// Of the image.
     pub image: f32,
     /// Of the robot's mask.
     pub mask: f32,
-    /// Of the reward.
     pub reward: f32,
     /// Of the continuation.
     pub continues: f32,

@@ -67,9 +67,7 @@ pub enum SimulatorError {
         "the physics of {task} diverged in episode {episode}, step {step}: a value is not finite; report the seed"
     )]
     Diverged {
-        /// The task.
         task: String,
-        /// The episode.
         episode: u64,
         /// The step within it.
         step: u32,
@@ -79,7 +77,6 @@ pub enum SimulatorError {
         "no controller has answered on instance {instance:?} for {seconds} s; start one, or raise --wait-controller"
     )]
     NoController {
-        /// The instance.
         instance: String,
         /// The time granted.
         seconds: u64,
@@ -92,5 +89,5 @@ pub enum SimulatorError {
     File(#[from] FileError),
     /// A picture could not be encoded.
     #[error("encoding a picture: {0}")]
-    Picture(#[from] image::ImageError),
+    Picture(#[from] rcwm_models::picture::PictureError),
 }

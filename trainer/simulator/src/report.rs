@@ -14,7 +14,6 @@ pub struct Durations(Histogram<u64>);
 
 /// Percentiles of [`Durations`], in microseconds.
 #[derive(Debug, Clone, Copy, Serialize)]
-#[allow(missing_docs)]
 pub struct Percentiles {
     pub count: u64,
     pub p50_us: u64,
@@ -98,7 +97,6 @@ pub struct Tally {
 
 /// The result of a run, as written to `--json`.
 #[derive(Debug, Serialize)]
-#[allow(missing_docs)]
 pub struct Report {
     pub task: String,
     pub instance: String,

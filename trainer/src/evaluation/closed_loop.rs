@@ -56,12 +56,7 @@ pub enum ClosedLoopError {
     File(#[from] FileError),
     /// A summary is unreadable.
     #[error("summary {path}: {source}; use programs of one version")]
-    Summary {
-        /// The file.
-        path: PathBuf,
-        /// What is wrong.
-        source: serde_json::Error,
-    },
+    Summary { path: PathBuf, source: serde_json::Error },
     /// A simulator was ended from outside: a rate over what it had done would not be that of the layouts asked for.
     #[error(
         "{found} of {expected} episodes were finished, a simulator was stopped from outside; run it again"
@@ -77,10 +72,7 @@ pub enum ClosedLoopError {
     Episode(#[from] EpisodeError),
     /// An episode was not recorded whole.
     #[error("episode {number} was not recorded: observations of it were lost; run it again")]
-    Unrecorded {
-        /// Its number.
-        number: u64,
-    },
+    Unrecorded { number: u64 },
     /// A policy that decides in this process gave a number that is not finite.
     #[error(
         "step {step} of episode {episode}: the policy's action is not finite, so nothing was scored; choose an earlier checkpoint"
@@ -88,7 +80,6 @@ pub enum ClosedLoopError {
     NotFinite {
         /// The episode's number.
         episode: u64,
-        /// The step.
         step: u32,
     },
     /// Acting in this process failed.

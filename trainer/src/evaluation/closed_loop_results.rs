@@ -16,12 +16,7 @@ pub enum ClosedLoopResultsError {
     File(#[from] FileError),
     /// It holds something else.
     #[error("{path}: {source}; expected what evaluate --task ... --json FILE writes")]
-    Json {
-        /// The file.
-        path: PathBuf,
-        /// What is wrong.
-        source: serde_json::Error,
-    },
+    Json { path: PathBuf, source: serde_json::Error },
 }
 
 /// What `evaluate --task ... --json FILE` writes: one policy on some tasks.

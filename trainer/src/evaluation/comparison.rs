@@ -19,13 +19,11 @@ pub enum Over {
 /// Two models, or two sets of models, on the same trajectories of a task.
 #[derive(Debug, Clone, PartialEq, Serialize)]
 pub struct Comparison {
-    /// The task.
     pub task: String,
     /// Kind of script; none for all.
     pub kind: Option<String>,
     /// What is compared.
     pub measure: Measure,
-    /// The model.
     pub model: String,
     /// What it is compared with.
     pub against: String,

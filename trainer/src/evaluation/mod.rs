@@ -85,7 +85,6 @@ pub enum EvaluationError {
         "{task}: none of {episodes} masked episodes has the {length} steps of a trajectory; imagine fewer, or collect longer ones"
     )]
     NoTrajectories {
-        /// The task.
         task: String,
         /// Its episodes with masks.
         episodes: usize,
@@ -98,7 +97,6 @@ pub enum EvaluationError {
          or imagine fewer (--context, --imagined), collect others, or take all windows (--windows anywhere)"
     )]
     NoMovingWindows {
-        /// The task.
         task: String,
         /// Its episodes with masks.
         episodes: usize,

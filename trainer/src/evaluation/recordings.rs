@@ -15,7 +15,6 @@ pub const OTHER_KIND: &str = "other";
 pub struct Recording {
     /// `expert`, `mixed`, `random`, `pushed` or [`OTHER_KIND`].
     pub kind: &'static str,
-    /// The episode.
     pub episode: Arc<Episode>,
 }
 

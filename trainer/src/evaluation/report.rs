@@ -26,7 +26,6 @@ pub struct ModelReport {
     pub seed: u64,
     /// Updates behind it.
     pub updates: u64,
-    /// Its tasks.
     pub tasks: Vec<TaskReport>,
 }
 

@@ -13,11 +13,8 @@ use crate::checkpoint::CheckpointSettings;
 /// A training, and what was measured of it.
 #[derive(Debug, Clone, Copy)]
 pub struct Trained<'a> {
-    /// What it is called.
     pub name: &'a str,
-    /// Its settings.
     pub settings: &'a CheckpointSettings,
-    /// Its tasks.
     pub tasks: &'a [TaskReport],
 }
 
@@ -41,7 +38,6 @@ pub struct SeedGroup {
 /// One measure of a group on a task.
 #[derive(Debug, Clone, PartialEq, Serialize)]
 pub struct SeedRow {
-    /// The task.
     pub task: String,
     /// Kind of script; none for all.
     pub kind: Option<String>,

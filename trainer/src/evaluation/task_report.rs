@@ -50,7 +50,6 @@ pub struct KindReport {
 /// A model on a task.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 pub struct TaskReport {
-    /// The task.
     pub task: String,
     /// Trajectories measured on.
     pub trajectories: usize,

@@ -30,10 +30,8 @@ pub struct Trajectory {
     pub steps: usize,
 }
 
-/// The trajectories of one task.
 #[derive(Debug, Clone)]
 pub struct TaskTrajectories {
-    /// The task.
     pub task: String,
     /// Steps of the longest.
     pub length: usize,

@@ -21,7 +21,6 @@ pub struct StateInputs {
 }
 
 impl Part<'_> {
-    /// A parameter as it is.
     pub fn parameter(&mut self, name: &str) -> Value {
         self.array(name, self.weights.get(name))
     }

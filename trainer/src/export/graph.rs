@@ -17,7 +17,6 @@ pub struct Value {
 }
 
 impl Value {
-    /// The shape.
     pub fn shape(&self) -> &[usize] {
         &self.shape
     }
@@ -164,7 +163,6 @@ pub fn ints(name: &str, values: &[i64]) -> Attribute {
     }
 }
 
-/// A float attribute.
 pub fn float(name: &str, value: f32) -> Attribute {
     Attribute { name: name.to_owned(), f: value, r#type: attribute_type::FLOAT, ..Attribute::default() }
 }

@@ -43,27 +43,16 @@ pub enum ExportError {
     NoTicks,
     /// The place is taken.
     #[error("export: {path} is there already; choose another folder or say --force")]
-    Exists {
-        /// The place.
-        path: PathBuf,
-    },
+    Exists { path: PathBuf },
     /// The place is taken by something that is no bundle, which is never replaced.
     #[error("export: {path} is there and is no bundle; choose another folder or remove it")]
-    NotABundle {
-        /// The place.
-        path: PathBuf,
-    },
+    NotABundle { path: PathBuf },
     /// The work was interrupted; nothing is left behind.
     #[error("export: interrupted; nothing was written")]
     Interrupted,
     /// A folder could not be made, moved or removed.
     #[error("export: {path}: {source}")]
-    Folder {
-        /// The folder.
-        path: PathBuf,
-        /// What the operating system said.
-        source: std::io::Error,
-    },
+    Folder { path: PathBuf, source: std::io::Error },
     /// A file could not be written.
     #[error("export: {0}")]
     File(#[from] FileError),

@@ -51,7 +51,6 @@ pub struct Look {
 /// A change of colours, one for a whole sequence: `gain * (colour + saturation * (grey - colour)) + offset`.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct Jitter {
-    /// By channel.
     pub gain: [f32; IMAGE_CHANNELS],
     /// By channel, of 255.
     pub offset: [f32; IMAGE_CHANNELS],

@@ -68,7 +68,6 @@ pub enum LearningError {
     NotFinite {
         /// Which number.
         what: &'static str,
-        /// Its value.
         value: f64,
     },
 }

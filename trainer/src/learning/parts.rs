@@ -6,7 +6,6 @@ use std::time::{Duration, Instant};
 /// Time of one part of an update.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub struct PartTime {
-    /// Which part.
     pub part: &'static str,
     /// How long it took.
     pub time: Duration,

@@ -7,9 +7,7 @@ use super::HostBatch;
 /// By how many pixels pictures move, right and down; what was at the edge fills the gap.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
 pub struct Shift {
-    /// To the right.
     pub right: isize,
-    /// Down.
     pub down: isize,
 }
 

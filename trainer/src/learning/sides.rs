@@ -5,9 +5,7 @@ pub enum Side {
     Robot,
     /// What knows the scene and the task: environment's encoder, dynamics and decoder, interaction, reward, continuation.
     Environment,
-    /// Actor.
     Actor,
-    /// Critic.
     Critic,
     /// The critic's slow copy, which no gradient trains.
     SlowCritic,
@@ -40,13 +38,10 @@ pub enum Trained {
     WorldAndActor,
     /// The environment's side and the actor, by one loss.
     EnvironmentAndActor,
-    /// The actor.
     Actor,
-    /// The critic.
     Critic,
     /// Actor and critic by one loss.
     Behaviour,
-    /// Nothing.
     Nothing,
 }
 

@@ -20,7 +20,6 @@ pub enum ParameterError {
     Missing {
         /// The parameter.
         name: String,
-        /// Its shape.
         shape: Vec<usize>,
     },
     /// A parameter that the model does not have.
@@ -30,7 +29,6 @@ pub enum ParameterError {
     Unknown {
         /// The parameter.
         name: String,
-        /// Its shape.
         shape: Vec<usize>,
     },
     /// A parameter has another shape than the settings say.
@@ -64,7 +62,6 @@ pub type Built<T> = Result<T, ParameterError>;
 pub struct ParameterSpec {
     /// Dotted name, as in checkpoints.
     pub name: String,
-    /// Shape.
     pub shape: Vec<usize>,
     /// How it starts.
     pub init: Init,

@@ -86,7 +86,6 @@ pub struct Applied {
     pub inputs: Vec<Tensor>,
     /// The last layer's output.
     pub out: Vec<f32>,
-    /// Its shape.
     pub shape: (usize, usize, usize, usize),
     /// For the way back.
     pub kept: Kept,

@@ -340,7 +340,6 @@ impl CustomOp1 for Node {
     }
 }
 
-/// One of its outputs.
 struct OutputShim {
     gradients: Shared,
     index: usize,

@@ -23,7 +23,6 @@ pub enum ReferenceError {
     /// A size in its metadata is missing, no number or too small.
     #[error("reference file: metadata {key}: found {found}, expected {expected}")]
     Metadata {
-        /// The key.
         key: &'static str,
         /// What was found.
         found: String,

@@ -50,7 +50,6 @@ impl Comparison {
 /// A group's tensors.
 #[derive(Debug, Clone, Serialize)]
 pub struct GroupReport {
-    /// The group.
     pub group: Group,
     /// How its errors are measured.
     pub measure: Measure,

@@ -12,7 +12,6 @@ use super::{Colour, PlotError};
 pub struct Line {
     /// Its name in the legend.
     pub label: String,
-    /// Its colour.
     pub colour: Colour,
     /// Points (x, y) in the order of x.
     pub points: Vec<(f64, f64)>,

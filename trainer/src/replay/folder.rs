@@ -14,19 +14,13 @@ use super::ReplayError;
 pub enum LoadError {
     /// A folder could not be listed.
     #[error("data: {path}: {source}")]
-    Folder {
-        /// The folder.
-        path: PathBuf,
-        /// What the operating system said.
-        source: io::Error,
-    },
+    Folder { path: PathBuf, source: io::Error },
     /// It holds no episodes.
     #[error(
         "data: {path} holds no .npz files, neither right there nor one folder down; {}",
         elsewhere(deeper)
     )]
     NoEpisodes {
-        /// The folder.
         path: PathBuf,
         /// A folder further down that has some.
         deeper: Option<PathBuf>,
@@ -34,7 +28,6 @@ pub enum LoadError {
     /// A folder of masks that does not exist, or has none of any episode.
     #[error("masks: {path}: {reason}")]
     NoMasks {
-        /// The folder.
         path: PathBuf,
         /// What was found, and what was looked for.
         reason: String,
@@ -47,18 +40,12 @@ pub enum LoadError {
     Episode(#[from] EpisodeError),
     /// An episode was refused.
     #[error("data: {path}: {source}")]
-    Refused {
-        /// The file.
-        path: PathBuf,
-        /// Why.
-        source: ReplayError,
-    },
+    Refused { path: PathBuf, source: ReplayError },
     /// A mask is no readable picture, or it cannot be told what it shows.
     #[error("masks: {path}: {reason}")]
     Mask {
         /// The picture, or the folder of an episode's.
         path: PathBuf,
-        /// What is wrong.
         reason: String,
     },
     /// There is not one mask for every step.
@@ -66,7 +53,6 @@ pub enum LoadError {
         "masks: {path} holds {found} pictures (.png), the episode has {expected} steps; it needs one for each"
     )]
     MaskCount {
-        /// The folder.
         path: PathBuf,
         /// Pictures found.
         found: usize,

@@ -43,7 +43,6 @@ impl Prefetch {
         Ok(Self { batches: Some(receiver), thread: Some(thread), waited: Duration::ZERO })
     }
 
-    /// The next batch.
     pub fn next_batch(&mut self) -> Result<HostBatch, PrefetchError> {
         let begin = Instant::now();
         let batches = self.batches.as_ref().ok_or(PrefetchError::Ended)?;

@@ -14,16 +14,11 @@ use crate::learning::{HostBatch, Look, LookSettings};
 pub enum ReplayError {
     /// It holds no steps.
     #[error("an episode of {task} holds no steps")]
-    Empty {
-        /// The task.
-        task: String,
-    },
+    Empty { task: String },
     /// An action or a reward is NaN or infinite.
     #[error("an episode of {task} holds a {what} at step {step} that is not finite; leave the episode out")]
     NotFinite {
-        /// The task.
         task: String,
-        /// What it is.
         what: &'static str,
         /// Where.
         step: usize,
@@ -33,9 +28,7 @@ pub enum ReplayError {
         "an episode of {task} has {steps} steps, the replay holds at most {capacity}; set replay.capacity_steps higher"
     )]
     TooLong {
-        /// The task.
         task: String,
-        /// Its steps.
         steps: usize,
         /// The replay's capacity in steps.
         capacity: usize,
@@ -48,10 +41,7 @@ pub enum ReplayError {
     },
     /// Masks are asked for and an episode in the sequence has none.
     #[error("an episode of {task} has no robot masks; draw from the masked episodes only")]
-    NoMasks {
-        /// The task.
-        task: String,
-    },
+    NoMasks { task: String },
 }
 
 /// Where sequences begin.

@@ -21,9 +21,7 @@ const ATTENTION_STEPS: usize = 64;
 /// A model that is measured.
 #[derive(Debug)]
 pub struct Subject {
-    /// What it is called.
     pub name: String,
-    /// Its settings.
     pub settings: CheckpointSettings,
     agent: Agent,
 }
@@ -33,9 +31,7 @@ pub struct Subject {
 pub struct DynamicsSource {
     /// The model's name.
     pub model: String,
-    /// Of its weights.
     pub weights_sha256: String,
-    /// The task.
     pub task: String,
     /// How the data were disturbed.
     pub disturb: String,
@@ -66,9 +62,7 @@ pub struct Dynamics {
 pub struct AttentionSource {
     /// The model's name.
     pub model: String,
-    /// Of its weights.
     pub weights_sha256: String,
-    /// The task.
     pub task: String,
     /// Of the task's episodes.
     pub data_sha256: String,

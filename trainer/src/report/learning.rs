@@ -20,9 +20,7 @@ pub struct LearningSource {
 pub struct LearningRun {
     /// What it is compared as: runs of one label are seeds of the same.
     pub label: String,
-    /// The task.
     pub task: String,
-    /// Its seed.
     pub seed: u64,
     /// Steps of the policy between two evaluations.
     pub every_steps: u64,
@@ -40,13 +38,10 @@ pub struct Learning {
 /// The seeds of one label on one task.
 #[derive(Debug, Clone, PartialEq, Serialize)]
 pub struct LearningCurve {
-    /// Label.
     pub label: String,
-    /// Task.
     pub task: String,
     /// The sets of layouts that its episodes were of.
     pub layouts: Vec<String>,
-    /// Seeds.
     pub seeds: Vec<u64>,
     /// In the order of steps.
     pub points: Vec<LearningPoint>,
@@ -55,7 +50,6 @@ pub struct LearningCurve {
 /// A point of a curve.
 #[derive(Debug, Clone, PartialEq, Serialize)]
 pub struct LearningPoint {
-    /// Steps of the environment.
     pub environment_steps: u64,
     /// Success rate of each seed that has come so far.
     pub rates: Vec<f64>,

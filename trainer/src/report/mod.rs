@@ -53,12 +53,7 @@ use crate::plots::PlotError;
 pub enum ReportError {
     /// A folder could not be made or listed.
     #[error("report: {path}: {source}")]
-    Folder {
-        /// The folder.
-        path: PathBuf,
-        /// What the operating system said.
-        source: std::io::Error,
-    },
+    Folder { path: PathBuf, source: std::io::Error },
     /// Somebody else measures for this report.
     #[error("report: {0}")]
     Lock(#[from] LockError),
@@ -67,12 +62,7 @@ pub enum ReportError {
     File(#[from] FileError),
     /// A part is unreadable.
     #[error("report: {path}: {reason}; remove the file and measure it again")]
-    Part {
-        /// The file.
-        path: PathBuf,
-        /// What is wrong.
-        reason: String,
-    },
+    Part { path: PathBuf, reason: String },
     /// A value cannot be written as JSON.
     #[error("report: {0}")]
     Json(#[source] serde_json::Error),
@@ -80,16 +70,12 @@ pub enum ReportError {
     #[error(
         "--bundles {path} holds no bundle of a task: expected folders with a manifest.toml, named after their tasks (hammer, ...)"
     )]
-    NoBundles {
-        /// The folder.
-        path: PathBuf,
-    },
+    NoBundles { path: PathBuf },
     /// Two bundles would be one row.
     #[error("--bundles: there are two policies {name:?} for {task}; rename one of their folders")]
     SamePolicy {
         /// The policy's name.
         name: String,
-        /// Its task.
         task: String,
     },
     /// A result file is none.
@@ -97,28 +83,13 @@ pub enum ReportError {
     ResultsFile(#[from] ClosedLoopResultsError),
     /// A result file cannot be taken.
     #[error("--results {path}: {reason}")]
-    Results {
-        /// The file.
-        path: PathBuf,
-        /// What is wrong.
-        reason: String,
-    },
+    Results { path: PathBuf, reason: String },
     /// A run cannot be taken.
     #[error("--runs {path}: {reason}")]
-    Run {
-        /// Its folder.
-        path: PathBuf,
-        /// What is wrong.
-        reason: String,
-    },
+    Run { path: PathBuf, reason: String },
     /// A bundle was refused.
     #[error("{path}: {source}")]
-    Bundle {
-        /// Its folder.
-        path: PathBuf,
-        /// Why.
-        source: Box<BundleError>,
-    },
+    Bundle { path: PathBuf, source: Box<BundleError> },
     /// A checkpoint was refused.
     #[error(transparent)]
     Checkpoint(#[from] CheckpointError),

@@ -55,7 +55,6 @@ pub struct Report {
 pub struct Compared {
     /// How the data were disturbed.
     pub disturb: String,
-    /// The comparison.
     #[serde(flatten)]
     pub comparison: Comparison,
 }

@@ -21,9 +21,7 @@ pub(super) struct Training {
 /// Trainings of one label on one task, taken together.
 #[derive(Debug, Clone, PartialEq, Serialize)]
 pub struct Pooled {
-    /// Label.
     pub label: String,
-    /// Task.
     pub task: String,
     /// Visual disturbance.
     pub disturb: String,
@@ -46,11 +44,9 @@ pub struct Pooled {
 /// Two labels on one task.
 #[derive(Debug, Clone, PartialEq, Serialize)]
 pub struct SuccessComparison {
-    /// Task.
     pub task: String,
     /// Visual disturbance.
     pub disturb: String,
-    /// Label.
     pub label: String,
     /// The label it is compared with.
     pub against: String,

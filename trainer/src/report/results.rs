@@ -25,17 +25,14 @@ pub struct ResultEntry {
     pub policy: String,
     /// Where the policy lay.
     pub of: String,
-    /// The task.
     pub task: String,
     /// Visual disturbance.
     pub disturb: String,
     /// Seed of the layouts.
     pub seed: u64,
-    /// Episodes.
     pub episodes: usize,
     /// Those that were solved.
     pub successes: usize,
-    /// Mean return.
     pub return_mean: f64,
 }
 

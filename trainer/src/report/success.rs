@@ -26,9 +26,7 @@ const FILM_AFTER: usize = 25;
 /// A bundle and the task it is for.
 #[derive(Debug, Clone)]
 pub struct Policy {
-    /// What it is called.
     pub name: String,
-    /// The task.
     pub task: String,
     /// The bundle's folder.
     pub folder: PathBuf,
@@ -45,13 +43,11 @@ pub struct Policy {
 pub struct SuccessSource {
     /// The policy's name.
     pub policy: String,
-    /// The task.
     pub task: String,
     /// Of the bundle's manifest.
     pub bundle_sha256: String,
     /// Visual disturbance.
     pub disturb: String,
-    /// Episodes.
     pub episodes: u64,
     /// Seed of their layouts.
     pub seed: u64,

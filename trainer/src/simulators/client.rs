@@ -14,7 +14,6 @@ const WAIT_SLICE: Duration = Duration::from_millis(100);
 /// Why talking to a simulator failed.
 #[derive(Debug, thiserror::Error)]
 pub enum ClientError {
-    /// The link.
     #[error(transparent)]
     Link(#[from] LinkError),
     /// The simulator's process.

@@ -37,7 +37,6 @@ pub struct CollectSettings {
 /// What was collected, by task and script.
 #[derive(Debug, Clone, Default, PartialEq, Serialize)]
 pub struct Collected {
-    /// Episodes.
     pub episodes: u64,
     /// Steps: decisions, the first observation of an episode not counted.
     pub steps: u64,

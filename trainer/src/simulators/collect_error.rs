@@ -22,7 +22,6 @@ pub enum CollectError {
          Collect into an empty folder"
     )]
     OtherEpisode {
-        /// The file.
         path: PathBuf,
         /// The disturbance.
         look: String,
@@ -32,12 +31,7 @@ pub enum CollectError {
     Lock(#[from] LockError),
     /// A folder could not be made.
     #[error("{path}: {source}")]
-    Folder {
-        /// The folder.
-        path: PathBuf,
-        /// What the operating system said.
-        source: std::io::Error,
-    },
+    Folder { path: PathBuf, source: std::io::Error },
 }
 
 impl From<super::ProcessError> for CollectError {

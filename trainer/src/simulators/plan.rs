@@ -47,7 +47,6 @@ impl Script {
 /// Episodes a task, by who decides.
 #[derive(Debug, Clone, Copy, Default, PartialEq, Eq)]
 pub struct Amounts {
-    /// By the expert.
     pub expert: u64,
     /// By the disturbed expert.
     pub mixed: u64,

@@ -26,7 +26,6 @@ pub enum ProcessError {
     Start {
         /// The program.
         path: PathBuf,
-        /// What the operating system said.
         source: std::io::Error,
     },
     /// It ended before its work was done.
@@ -48,7 +47,6 @@ pub enum ProcessError {
         name: &'static str,
         /// Its link.
         instance: String,
-        /// What the operating system said.
         source: std::io::Error,
     },
 }

@@ -28,7 +28,6 @@ pub struct EvaluationFacts {
     pub environment_steps: u64,
     /// The set of layouts.
     pub layouts: String,
-    /// Episodes.
     pub episodes: u64,
     /// Episodes in which the task was solved at some step.
     pub successes: u64,

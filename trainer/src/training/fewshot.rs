@@ -35,7 +35,6 @@ pub enum Stage {
     Environment,
     /// The whole world model.
     World,
-    /// The actor.
     Actor,
 }
 

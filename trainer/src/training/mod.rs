@@ -106,14 +106,10 @@ pub enum TrainingError {
     LookOnGpu,
     /// The folder holds a run.
     #[error("{path} holds a run already; say --resume, or choose another folder")]
-    Exists {
-        /// The folder.
-        path: PathBuf,
-    },
+    Exists { path: PathBuf },
     /// There is nothing to resume.
     #[error("{path} holds no run to resume (no {file}); leave --resume out to start one")]
     NothingToResume {
-        /// The folder.
         path: PathBuf,
         /// What is missing.
         file: &'static str,
@@ -121,7 +117,6 @@ pub enum TrainingError {
     /// The folder is one of a run's checkpoints.
     #[error("{path} is a checkpoint of a run; name the run's folder: {run}")]
     InsideARun {
-        /// The folder.
         path: PathBuf,
         /// The run's.
         run: PathBuf,
@@ -132,7 +127,6 @@ pub enum TrainingError {
     /// The folder holds a run of another kind.
     #[error("{path} holds a run of {found}; resume it with `rcwm-trainer {found} --resume`")]
     OtherPhase {
-        /// The folder.
         path: PathBuf,
         /// What made it.
         found: &'static str,
@@ -144,7 +138,6 @@ pub enum TrainingError {
     NoDemonstrations {
         /// Where was looked.
         path: PathBuf,
-        /// The task.
         task: String,
         /// Episodes that were looked at.
         episodes: usize,
@@ -154,12 +147,7 @@ pub enum TrainingError {
     OtherModel,
     /// The run's folder could not be read or written.
     #[error("{path}: {source}")]
-    Folder {
-        /// What.
-        path: PathBuf,
-        /// What the operating system said.
-        source: std::io::Error,
-    },
+    Folder { path: PathBuf, source: std::io::Error },
     /// A file could not be read or written.
     #[error(transparent)]
     File(#[from] FileError),

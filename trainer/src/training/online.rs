@@ -11,7 +11,6 @@ pub struct EpisodeLine {
     pub update: u64,
     /// `online`.
     pub phase: &'static str,
-    /// The episode.
     pub episode: EpisodeFacts,
 }
 
@@ -20,7 +19,6 @@ pub struct EpisodeLine {
 pub struct EpisodeFacts {
     /// Episodes that the policy has finished, this one included.
     pub number: u64,
-    /// Which simulator.
     pub simulator: usize,
     /// Whether the task was solved at any step.
     pub success: bool,

@@ -88,7 +88,6 @@ pub struct FewshotSettings {
     pub environment_updates: u64,
     /// Updates of the whole world model.
     pub world_updates: u64,
-    /// Updates of the actor.
     pub actor_updates: u64,
     /// Factor of the cloning loss while the world model learns: above 0 the actor learns from the first update on, and its gradient goes
     /// on into posteriors and encoders. 0 is what the authors do.

@@ -86,7 +86,6 @@ pub(super) enum Resume {
 /// Whether a checkpoint is the best one so far, and so is kept apart from the newest.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Best {
-    /// It is.
     Yes,
     /// It is not.
     No,

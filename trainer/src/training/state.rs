@@ -27,12 +27,7 @@ pub enum StateError {
     File(#[from] FileError),
     /// The folder could not be listed or cleaned.
     #[error("training state: {path}: {source}")]
-    Folder {
-        /// The folder.
-        path: PathBuf,
-        /// What the operating system said.
-        source: std::io::Error,
-    },
+    Folder { path: PathBuf, source: std::io::Error },
     /// It is no readable file of arrays.
     #[error("training state: {0}")]
     Tensors(#[from] TensorsError),

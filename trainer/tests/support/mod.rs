@@ -28,7 +28,6 @@ pub fn reference_checkpoint() -> Checkpoint {
     Checkpoint { settings: settings(reference.settings), parameters }
 }
 
-/// An untrained checkpoint.
 pub fn untrained(kind: ModelKind, seed: u64) -> Checkpoint {
     let model = ModelSettings::preset(Preset::Debug, kind);
     let parameters = agent::initialise(&model, seed, &Device::Cpu).unwrap();

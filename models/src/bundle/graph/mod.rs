@@ -56,7 +56,6 @@ pub enum GraphError {
     /// A name that is missing, unknown or taken.
     #[error("value {name:?} {problem}")]
     Name {
-        /// The name.
         name: String,
         /// What is wrong with it.
         problem: &'static str,
@@ -71,18 +70,11 @@ pub enum GraphError {
     },
     /// An operator that is not on the list.
     #[error("node {node:?}: operator {operator:?} is not one that a part may use")]
-    Operator {
-        /// The node.
-        node: String,
-        /// The operator.
-        operator: String,
-    },
+    Operator { node: String, operator: String },
     /// A node whose attributes or inputs do not fit its operator.
     #[error("node {node:?} ({operator}): {reason}")]
     Node {
-        /// The node.
         node: String,
-        /// The operator.
         operator: String,
         /// What does not fit.
         reason: String,
@@ -102,7 +94,6 @@ pub enum GraphError {
     Value {
         /// The value.
         name: String,
-        /// What it is.
         found: String,
         /// What it is said to be.
         expected: String,

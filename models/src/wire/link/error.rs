@@ -19,19 +19,13 @@ pub enum LinkError {
         "shared memory is full: /dev/shm has {free_kib} KiB free, the link needs {needed_kib}; remove what fills it, or give the \
          container more (docker run --shm-size=256m; Kubernetes: an emptyDir with medium Memory at /dev/shm)"
     )]
-    Memory {
-        /// What is free, in KiB.
-        free_kib: u64,
-        /// What is needed, in KiB.
-        needed_kib: u64,
-    },
+    Memory { free_kib: u64, needed_kib: u64 },
     /// A folder of iceoryx2's keeps this user out.
     #[error(
         "shared memory: {path} belongs to user {owner}, and this user may not write there; run all programs as one user, or let \
          user {owner} (or root) open it: chmod 1777 {root} {root}/services {root}/nodes"
     )]
     FolderOfOtherUser {
-        /// The folder.
         path: PathBuf,
         /// Number of its owner.
         owner: u32,

@@ -46,7 +46,6 @@ impl LinkSettings {
 /// What a wait ended with.
 #[derive(Debug)]
 pub enum Wait<T> {
-    /// A message.
     Message(T),
     /// The time was up, or a signal to the process (Ctrl-C) has cut the wait short.
     TimedOut,

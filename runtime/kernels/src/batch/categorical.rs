@@ -61,7 +61,6 @@ impl Mix {
 /// What is made of the probabilities.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Output {
-    /// The probabilities.
     Probabilities,
     /// Their logarithms.
     Logarithms,

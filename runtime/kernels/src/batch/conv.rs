@@ -15,12 +15,10 @@ pub struct Map {
     pub height: usize,
     /// Columns.
     pub width: usize,
-    /// Channels.
     pub channels: usize,
 }
 
 impl Map {
-    /// Numbers in it.
     pub fn numbers(self) -> usize {
         self.height * self.width * self.channels
     }

@@ -30,7 +30,6 @@ pub struct Step {
     pub name: &'static str,
     /// Median between image and action.
     pub p50_us: f64,
-    /// Share of the limit.
     pub share_of_limit: f64,
 }
 

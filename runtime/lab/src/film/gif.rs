@@ -1,6 +1,5 @@
 //! Films (GIF) and film strips (PNG).
 
-use std::io::Cursor;
 use std::path::Path;
 
 use rcwm_models::IMAGE_SIDE;
@@ -8,12 +7,12 @@ use rcwm_models::files::write_atomic;
 
 use super::FilmError;
 use super::canvas::{Canvas, enlarge};
+use rcwm_models::picture::write_png;
 
 /// Screen pixels per pixel of the observation in a film.
 const FILM_SCALE: usize = 3;
 /// The same in a strip.
 const STRIP_SCALE: usize = 2;
-/// Frames of a strip.
 const STRIP_FRAMES: usize = 10;
 /// Shortest time between two frames: enough to follow an arm, at a third of the size of every tick.
 const FRAME_CS_MIN: f64 = 7.5;
@@ -137,18 +136,8 @@ pub(super) fn write_strip(path: &Path, columns: &[&[Canvas]]) -> Result<(), Film
         }
     }
     let strip = strip.enlarged(STRIP_SCALE);
-    let mut png = Vec::new();
-    let failed = |reason: String| FilmError::Picture { path: path.to_path_buf(), reason };
-    image::write_buffer_with_format(
-        &mut Cursor::new(&mut png),
-        &strip.rgb,
-        u32::try_from(strip.width).map_err(|error| failed(error.to_string()))?,
-        u32::try_from(strip.height).map_err(|error| failed(error.to_string()))?,
-        image::ExtendedColorType::Rgb8,
-        image::ImageFormat::Png,
-    )
-    .map_err(|error| failed(error.to_string()))?;
-    Ok(write_atomic(path, &png)?)
+    let side = |pixels: usize| u32::try_from(pixels).unwrap_or(u32::MAX);
+    Ok(write_png(path, [side(strip.width), side(strip.height)], &strip.rgb)?)
 }
 
 #[cfg(test)]

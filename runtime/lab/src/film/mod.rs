@@ -29,6 +29,7 @@ use serde::Serialize;
 use crate::log::{LoggedEpisode, ReplayError, Replayer};
 use canvas::Canvas;
 use panels::{Decoded, Shown, film_frame, strip_panels};
+use rcwm_models::picture::PictureError;
 
 /// Longest film, in ticks; longer episodes are filmed to here and kept whole as `.npz`.
 const FILM_TICKS_MAX: usize = 1000;
@@ -53,14 +54,12 @@ pub enum FilmError {
     /// The decoder failed.
     #[error("film: {0}")]
     Engine(#[from] EngineError),
-    /// A picture could not be packed.
+    /// A strip could not be written.
+    #[error("film: {0}")]
+    Strip(#[from] PictureError),
+    /// A film could not be packed.
     #[error("film: {path}: {reason}")]
-    Picture {
-        /// The file.
-        path: PathBuf,
-        /// What is wrong.
-        reason: String,
-    },
+    Picture { path: PathBuf, reason: String },
 }
 
 impl From<LogError> for FilmError {

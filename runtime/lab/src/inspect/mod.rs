@@ -15,18 +15,14 @@ pub struct InspectError {
     source: CostError,
 }
 
-/// One part.
 #[derive(Debug, Clone, PartialEq, Serialize)]
 pub struct PartInfo {
-    /// The part.
     pub part: PartName,
     /// Whether it runs in every tick.
     pub in_tick: bool,
     /// Size of its file.
     pub file_bytes: u64,
-    /// Inputs.
     pub inputs: Vec<TensorSpec>,
-    /// Outputs.
     pub outputs: Vec<TensorSpec>,
     /// Cost of a run.
     #[serde(flatten)]
@@ -36,7 +32,6 @@ pub struct PartInfo {
 /// A whole bundle.
 #[derive(Debug, Clone, PartialEq, Serialize)]
 pub struct BundleInfo {
-    /// The manifest.
     pub manifest: Manifest,
     /// Ticks of golden values.
     pub golden_ticks: usize,

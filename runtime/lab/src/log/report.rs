@@ -14,7 +14,6 @@ pub struct Answers {
     pub policy: u64,
     /// The policy, on a state that the world model imagined.
     pub imagined: u64,
-    /// The fallback.
     pub fallback: u64,
 }
 

@@ -17,7 +17,6 @@ pub(super) struct Places {
     pub(super) std: Place,
 }
 
-/// Places of a branch.
 pub(super) struct BranchPlaces {
     pub(super) z: Option<Place>,
     pub(super) h: Option<Place>,

@@ -38,7 +38,6 @@ pub struct LearnerSettings {
 /// A batch as the trainer draws it: sequences first, then steps.
 #[derive(Debug, Clone, Copy)]
 pub struct Batch<'a> {
-    /// Its images.
     pub images: Images<'a>,
     /// [B, T, action].
     pub action: &'a [f32],

@@ -77,9 +77,7 @@ pub struct Ready {
 /// How long a part of a program took.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct PartTime {
-    /// The part.
     pub part: &'static str,
-    /// Commands in it.
     pub commands: usize,
     /// Time on the device.
     pub ms: f64,
@@ -101,7 +99,6 @@ pub struct CommandTime {
 }
 
 impl Machine {
-    /// The host.
     #[must_use]
     pub fn host() -> Self {
         Self::Host(Host::default())

@@ -7,7 +7,6 @@ use crate::layers::Draw;
 /// Sizes of a batch and of the model.
 #[derive(Debug, Clone)]
 pub struct Sizes {
-    /// The model.
     pub model: ModelSettings,
     /// B, sequences.
     pub batch: usize,

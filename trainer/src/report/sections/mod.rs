@@ -23,7 +23,6 @@ const PLOT: (u32, u32) = (560, 360);
 pub(super) struct Section {
     /// Where links lead.
     pub(super) id: &'static str,
-    /// Its title.
     pub(super) title: &'static str,
     /// What stands in it.
     pub(super) body: Markup,
