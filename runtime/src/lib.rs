@@ -5,8 +5,6 @@
 //! | [`engine`] | what runs an ONNX part: tract, or ONNX Runtime (feature `ort`) |
 //! | [`mod@compile`] | the exported parts as one graph, its hot nodes fused, cut where the image comes in |
 //! | [`operators`] | our operators in tract, which the fused nodes become |
-//! | [`team`] | a second thread for the tick |
-//! | [`kernels`] | convolution, products, norms and latents for vector registers |
 //! | [`policy`] | one tick: image and executed action in, action distribution out; carries z and h of both branches |
 //! | [`controller`] | the loop over shared memory: state machine, fallback, action limits, counters |
 //! | [`pacing`] | when the next observation is due, how to wait for it, when it counts as late |
