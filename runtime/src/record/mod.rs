@@ -41,7 +41,9 @@ pub trait Sink: Send + 'static {
 /// Hands a record of every tick to a sink.
 pub struct Recorder<S> {
     full: Option<SyncSender<Box<Record>>>,
-    free: Receiver<Box<Record>>,
+    /// Records that come back from the writer, and those that have.
+    back: Receiver<Box<Record>>,
+    free: Vec<Box<Record>>,
     thread: Option<JoinHandle<S>>,
     dropped: Arc<AtomicU64>,
     progress: Progress,
@@ -73,11 +75,8 @@ impl<S: Sink> Recorder<S> {
     pub fn with_records(policy: &Policy, sink: S, records: usize) -> Result<Self, WriterLost> {
         let records = records.max(1);
         let (full, filled) = sync_channel(records);
-        let (give_back, free) = sync_channel(records);
-        for _ in 0..records {
-            // Both ends are here and there is room for all of them.
-            let _ = give_back.try_send(Box::new(Record::new(policy)));
-        }
+        let (give_back, back) = sync_channel(records);
+        let free = (0..records).map(|_| Box::new(Record::new(policy))).collect();
         let (dropped, pictures) = (Arc::new(AtomicU64::new(0)), sink.wants_pictures());
         let dropped_so_far = Arc::clone(&dropped);
         let thread = std::thread::Builder::new()
@@ -85,7 +84,7 @@ impl<S: Sink> Recorder<S> {
             .spawn(move || write(sink, &filled, &give_back, &dropped_so_far))
             .map_err(|error| WriterLost(format!("could not be started: {error}")))?;
         let (full, thread, progress) = (Some(full), Some(thread), Progress::of(policy));
-        Ok(Self { full, free, thread, dropped, progress, pictures })
+        Ok(Self { full, back, free, thread, dropped, progress, pictures })
     }
 
     /// Waits until the sink has taken all records.
@@ -103,7 +102,9 @@ impl<S: Sink> TickObserver for Recorder<S> {
     fn ticked(&mut self, tick: &Tick<'_>) {
         let Some(full) = &self.full else { return };
         let lockstep = tick.observation.is_some_and(|observation| observation.period_ns == 0);
-        let free = if lockstep { self.free.recv().ok() } else { self.free.try_recv().ok() };
+        self.free.extend(self.back.try_iter());
+        // The one that came back last is the likeliest to be in the caches.
+        let free = self.free.pop().or_else(|| if lockstep { self.back.recv().ok() } else { None });
         let Some(mut record) = free else {
             self.progress.dropped += 1;
             self.dropped.fetch_add(1, Ordering::Relaxed);
