@@ -61,6 +61,24 @@ fn a_run_that_records_takes_swaps_and_is_filmed_with_both_policies() {
 }
 
 #[test]
+fn what_could_not_be_filmed_is_filmed_by_the_command_that_is_told() {
+    let (link, folder) = (own_link(), tempfile::tempdir().unwrap());
+    let peer = link.peer();
+    // It is there when the run begins, and fails after it.
+    let run = run(&link).arg("--record").arg(folder.path()).env("RCWM_LAB", "/bin/false").spawn().unwrap();
+    episode(&peer, 0);
+    peer.close().unwrap();
+    let output = run.wait_with_output().unwrap();
+    assert_eq!(output.status.code(), Some(1));
+    let said = String::from_utf8(output.stderr).unwrap();
+    let error = said.lines().find(|line| line.starts_with("error: the films")).unwrap();
+    let command = error.split('`').nth(1).unwrap().strip_prefix("rcwm-lab ").unwrap();
+    let again = Command::new(env!("CARGO_BIN_EXE_rcwm-lab")).args(command.split(' ')).output().unwrap();
+    assert!(again.status.success(), "{command}: {}", String::from_utf8_lossy(&again.stderr));
+    assert!(folder.path().join("episode-0000.gif").is_file(), "{command}");
+}
+
+#[test]
 fn without_the_lab_a_run_that_records_does_not_begin() {
     let (link, folder) = (own_link(), tempfile::tempdir().unwrap());
     let mut run = run(&link);

@@ -1,7 +1,7 @@
 //! What is recorded while `run` goes on, and what is made of it afterwards: films, a log, snapshots, latencies.
 
+use std::ffi::OsString;
 use std::path::{Path, PathBuf};
-use std::process::Command;
 use std::time::Duration;
 
 use anyhow::Context;
@@ -243,13 +243,16 @@ impl Left {
         };
         // It takes the lock itself.
         drop(lock);
-        let arguments = |lab: &mut Command| {
-            lab.args(["film", "--episodes", &episodes.to_string(), "--log"]).arg(&log.file);
-            log.bundles.iter().for_each(|bundle| _ = lab.arg("--bundle").arg(bundle));
-            lab.arg("--out").arg(&folder);
-        };
-        lab::run("drawing films", arguments).with_context(|| {
-            format!("the films were not drawn; `rcwm-lab film --log {}` tries again", log.file.display())
+        let (option, episodes) = (|name: &str| OsString::from(name), OsString::from(episodes.to_string()));
+        let mut words =
+            vec![option("film"), option("--episodes"), episodes, option("--log"), log.file.into()];
+        for bundle in log.bundles {
+            words.extend([option("--bundle"), bundle.into()]);
+        }
+        words.extend([option("--out"), folder.into()]);
+        lab::run("drawing films", |lab| _ = lab.args(&words)).with_context(|| {
+            let words: Vec<_> = words.iter().map(|word| word.to_string_lossy()).collect();
+            format!("the films were not drawn; `rcwm-lab {}` tries again", words.join(" "))
         })
     }
 }

@@ -12,7 +12,7 @@ pub enum ControllerError {
     Link(#[from] LinkError),
     /// Nobody published an observation.
     #[error(
-        "no observation came on instance {instance:?} in {timeout_s} s; start `rcwm-simulator serve --instance {instance}` \
+        "no observation came on instance {instance:?} in {timeout_s} s; start `rcwm-simulator serve --task TASK --instance {instance}` \
          (same user, same RCWM_PREFIX), or wait longer with --timeout"
     )]
     NoObservation {

@@ -104,7 +104,7 @@ pub enum SwapError {
     },
     /// Nobody answers.
     #[error(
-        "no run on instance {instance:?} takes swaps: {source}; start `rcwm-runtime run --instance {instance}` (same machine, \
+        "no run on instance {instance:?} takes swaps: {source}; start `rcwm-runtime run --bundle DIR --instance {instance}` (same machine, \
          same RCWM_PREFIX)"
     )]
     NoServer { instance: String, source: io::Error },
