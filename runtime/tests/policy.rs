@@ -51,7 +51,7 @@ fn samples_repeat_with_their_seed_and_stay_within_the_limits() {
 }
 
 #[test]
-fn what_is_unfit_is_refused_and_leaves_the_state_alone() {
+fn what_is_invalid_is_refused_and_leaves_the_state_alone() {
     let mut policy = Policy::load(&smallest_bundle(), EngineSettings::tract()).unwrap();
     run(&mut policy, 3);
     let before = policy.state().clone();

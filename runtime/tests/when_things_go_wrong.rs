@@ -248,7 +248,7 @@ fn in_lock_step_nothing_is_overdue() {
 }
 
 #[test]
-fn a_policy_that_is_unfit_for_too_long_stops_the_run_and_says_why() {
+fn a_policy_that_is_invalid_for_too_long_stops_the_run_and_says_why() {
     let bundle = dividing_by_zero(PartName::Actor);
     let link = own_link();
     let peer = link.peer();

@@ -204,7 +204,7 @@ fn a_tick_that_stalls_is_not_followed_by_a_burst() {
 }
 
 #[test]
-fn a_policy_that_is_unfit_for_too_long_ends_the_run_with_its_own_exit_code() {
+fn a_policy_that_is_invalid_for_too_long_ends_the_run_with_its_own_exit_code() {
     let poisoned = poisoned_bundle();
     let bed = Bed::new(PERIOD);
     let bundle = poisoned.path().to_path_buf();

@@ -36,7 +36,7 @@ fn unfit_value(tensor: &Tensor, weight_max: f32) -> Option<f32> {
         return None;
     }
     let values = tensor.raw_data.as_chunks::<4>().0.iter().map(|bytes| f32::from_le_bytes(*bytes));
-    // Written so that NaN is unfit.
+    // Written so that NaN is invalid.
     values
         .into_iter()
         .find(|value| !matches!(value.abs().partial_cmp(&weight_max), Some(order) if order.is_le()))

@@ -71,8 +71,8 @@ impl LogReader {
             Next::End => return Err(no_log("it ends before its header".into())),
             Next::Damaged(reason) => return Err(no_log(format!("its header is damaged: {reason}"))),
         };
-        if let Some(unfit) = header.unfit() {
-            return Err(no_log(format!("its header tells of {unfit}")));
+        if let Some(invalid) = header.invalid() {
+            return Err(no_log(format!("its header tells of {invalid}")));
         }
         let path = path.to_path_buf();
         let images = ImagePacker::default();

@@ -46,7 +46,7 @@ pub struct Header {
 
 impl Header {
     /// What in it no run could have written; a checksum only says that nothing was changed since.
-    pub fn unfit(&self) -> Option<String> {
+    pub fn invalid(&self) -> Option<String> {
         if !(1..=THREADS_MAX).contains(&self.engine.threads) {
             return Some(format!(
                 "an engine with {} threads, expected 1 to {THREADS_MAX}",

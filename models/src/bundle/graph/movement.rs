@@ -48,7 +48,7 @@ pub(super) fn gather(attributes: &mut Attributes<'_>, inputs: &[&Value]) -> Infe
 pub(super) fn reshape(inputs: &[&Value]) -> Inferred {
     let [x, wanted] = take(inputs)?;
     let wanted = constant_integers(wanted, "the shape")?;
-    let unfit = || format!("{:?} cannot become {wanted:?}", x.shape);
+    let invalid = || format!("{:?} cannot become {wanted:?}", x.shape);
     let mut shape = Vec::new();
     let mut open = None;
     for (i, dim) in wanted.iter().enumerate() {
@@ -58,30 +58,30 @@ pub(super) fn reshape(inputs: &[&Value]) -> Inferred {
                 1
             }
             // Zero keeps the dimension that is there.
-            0 => *x.shape.get(i).ok_or_else(unfit)?,
-            dim => usize::try_from(*dim).map_err(|_| unfit())?,
+            0 => *x.shape.get(i).ok_or_else(invalid)?,
+            dim => usize::try_from(*dim).map_err(|_| invalid())?,
         });
     }
     let product =
-        shape.iter().try_fold(1_usize, |product, dim| product.checked_mul(*dim)).ok_or_else(unfit)?;
+        shape.iter().try_fold(1_usize, |product, dim| product.checked_mul(*dim)).ok_or_else(invalid)?;
     if let Some(open) = open {
-        shape[open] = x.elements().checked_div(product).ok_or_else(unfit)?;
+        shape[open] = x.elements().checked_div(product).ok_or_else(invalid)?;
     }
     let reshaped = x.reshaped(shape);
-    if reshaped.elements() == x.elements() { Ok(vec![reshaped]) } else { Err(unfit()) }
+    if reshaped.elements() == x.elements() { Ok(vec![reshaped]) } else { Err(invalid()) }
 }
 
 pub(super) fn split(attributes: &mut Attributes<'_>, inputs: &[&Value], outputs: usize) -> Inferred {
     let [x, sizes] = take(inputs)?;
     let axis = attributes.axis(0, x.rank())?;
     let sizes = constant_integers(sizes, "sizes")?;
-    let unfit =
+    let invalid =
         || format!("{:?} on axis {axis} cannot be split into {sizes:?} for {outputs} outputs", x.shape);
     let lens = sizes.iter().map(|len| usize::try_from(*len).ok().filter(|len| *len > 0));
-    let lens: Vec<usize> = lens.collect::<Option<_>>().ok_or_else(unfit)?;
+    let lens: Vec<usize> = lens.collect::<Option<_>>().ok_or_else(invalid)?;
     let sum = lens.iter().try_fold(0_usize, |sum, len| sum.checked_add(*len));
     if sum != Some(x.shape[axis]) || lens.len() != outputs {
-        return Err(unfit());
+        return Err(invalid());
     }
     let part = |len| {
         let mut shape = x.shape.clone();

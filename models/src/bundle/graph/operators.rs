@@ -128,14 +128,14 @@ fn layer_norm(attributes: &mut Attributes<'_>, inputs: &[&Value]) -> Inferred {
 
 fn mat_mul(inputs: &[&Value]) -> Inferred {
     let [a, b] = floats(inputs)?;
-    let unfit = || format!("shapes {:?} and {:?} cannot be multiplied", a.shape, b.shape);
+    let invalid = || format!("shapes {:?} and {:?} cannot be multiplied", a.shape, b.shape);
     let (Some((a_outer, [rows, a_inner])), Some((b_outer, [b_inner, columns]))) =
         (a.shape.split_last_chunk::<2>(), b.shape.split_last_chunk::<2>())
     else {
-        return Err(unfit());
+        return Err(invalid());
     };
     if a_inner != b_inner {
-        return Err(unfit());
+        return Err(invalid());
     }
     let mut shape = broadcast(a_outer, b_outer)?;
     shape.extend([*rows, *columns]);
