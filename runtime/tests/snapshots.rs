@@ -2,7 +2,6 @@
 
 #![allow(clippy::unwrap_used, reason = "a test that fails panics")]
 
-use std::path::Path;
 use std::sync::atomic::AtomicBool;
 use std::time::Duration;
 
@@ -10,18 +9,8 @@ use rcwm_runtime::controller::Fallback;
 use rcwm_runtime::record::{Finished, Recorder};
 use rcwm_runtime::snapshots::{SnapshotSettings, Snapshots};
 use rcwm_runtime::{EngineSettings, Policy};
-use rcwm_testkit::{ask, observation, own_link, smallest_bundle, start_with};
+use rcwm_testkit::{ask, json_lines, latency_of, observation, own_link, smallest_bundle, start_with};
 use serde_json::Value;
-
-fn lines(file: &Path) -> Vec<Value> {
-    let text = std::fs::read_to_string(file).unwrap();
-    text.lines().map(|line| serde_json::from_str(line).unwrap()).collect()
-}
-
-fn stage<'a>(summary: &'a Value, name: &str) -> &'a Value {
-    let stages = summary["latency"].as_array().unwrap();
-    stages.iter().find(|latency| latency["stage"] == name).unwrap_or(&Value::Null)
-}
 
 #[test]
 fn snapshots_add_up_to_the_run() {
@@ -44,16 +33,16 @@ fn snapshots_add_up_to_the_run() {
     }
     peer.close().unwrap();
     controller.join().unwrap();
-    let lines = lines(&file);
+    let lines = json_lines(&file);
     assert!(lines.len() > 2 && lines.iter().rev().skip(1).all(|line| line["last"] == false));
     let last = lines.last().unwrap();
     let sum: u64 = lines.iter().map(|line| line["interval"]["ticks"].as_u64().unwrap()).sum();
     assert_eq!((sum, &last["last"], &last["samples_dropped"]), (40, &true.into(), &0.into()));
     assert_eq!(last["counters"]["observations"], 40);
     for name in ["encoder", "actor", "tick", "end_to_end"] {
-        let of = |line: &Value| stage(&line["interval"], name)["count"].as_u64().unwrap_or(0);
+        let of = |line: &Value| latency_of(&line["interval"], name)["count"].as_u64().unwrap_or(0);
         assert_eq!(lines.iter().map(of).sum::<u64>(), 40, "{name}");
-        assert_eq!(stage(&last["total"], name)["count"], 40, "{name}");
+        assert_eq!(latency_of(&last["total"], name)["count"], 40, "{name}");
     }
     for branch in ["robot_surprise", "environment_surprise"] {
         let found = &last["total"][branch];

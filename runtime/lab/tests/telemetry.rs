@@ -2,22 +2,11 @@
 
 #![allow(clippy::unwrap_used, reason = "a test that fails panics")]
 
-use std::path::Path;
 use std::process::{Command, Stdio};
 
 use rcwm_models::programs::Program;
-use rcwm_testkit::{ask, observation, own_link, smallest_bundle};
+use rcwm_testkit::{ask, json_lines, latency_of, observation, own_link, smallest_bundle};
 use serde_json::Value;
-
-fn lines(file: &Path) -> Vec<Value> {
-    let text = std::fs::read_to_string(file).unwrap();
-    text.lines().map(|line| serde_json::from_str(line).unwrap()).collect()
-}
-
-fn stage<'a>(summary: &'a Value, name: &str) -> &'a Value {
-    let stages = summary["latency"].as_array().unwrap();
-    stages.iter().find(|latency| latency["stage"] == name).unwrap_or(&Value::Null)
-}
 
 #[test]
 fn a_run_leaves_a_log_percentile_files_and_a_plot() {
@@ -39,13 +28,13 @@ fn a_run_leaves_a_log_percentile_files_and_a_plot() {
     }
     peer.close().unwrap();
     assert!(run.wait().unwrap().success());
-    assert_eq!(lines(&at("jsonl")).last().unwrap()["total"]["ticks"], 20);
+    assert_eq!(json_lines(&at("jsonl")).last().unwrap()["total"]["ticks"], 20);
     let mut telemetry = Command::new(env!("CARGO_BIN_EXE_rcwm-lab"));
     telemetry.args(["telemetry", "--log"]).arg(at("log")).arg("--hgrm").arg(at("again"));
     telemetry.arg("--plot").arg(at("again.png")).arg("--json").arg(at("again.json"));
     assert!(telemetry.output().unwrap().status.success());
     let report: Value = serde_json::from_slice(&std::fs::read(at("again.json")).unwrap()).unwrap();
-    assert_eq!((&report["ticks"], &stage(&report, "tick")["count"]), (&20.into(), &20.into()));
+    assert_eq!((&report["ticks"], &latency_of(&report, "tick")["count"]), (&20.into(), &20.into()));
     for name in ["tick.hgrm", "encoder.hgrm", "end_to_end.hgrm"] {
         let texts = ["hgrm", "again"].map(|folder| std::fs::read_to_string(at(folder).join(name)).unwrap());
         assert_eq!(texts[0], texts[1], "the log holds the times that the run measured");

@@ -23,6 +23,7 @@ use rcwm_runtime::controller::{Controller, ControllerError, ControllerSettings, 
 use rcwm_runtime::log::{LogSettings, LogSummary, LogWriter};
 use rcwm_runtime::record::{Finished, Recorder};
 use rcwm_runtime::{EngineKind, EngineSettings, Policy};
+use serde_json::Value;
 
 /// The smallest bundle that is shipped.
 pub fn smallest_bundle() -> PathBuf {
@@ -282,4 +283,16 @@ pub fn ask(peer: &SimulatorLink, observation: &Observation) -> Action {
         }
     }
     panic!("observation {} was not answered", observation.sequence);
+}
+
+/// A file of JSON lines.
+pub fn json_lines(file: &Path) -> Vec<Value> {
+    let text = std::fs::read_to_string(file).unwrap();
+    text.lines().map(|line| serde_json::from_str(line).unwrap()).collect()
+}
+
+/// What a summary of latencies says of a stage.
+pub fn latency_of<'a>(summary: &'a Value, name: &str) -> &'a Value {
+    let stages = summary["latency"].as_array().unwrap();
+    stages.iter().find(|latency| latency["stage"] == name).unwrap_or(&Value::Null)
 }
