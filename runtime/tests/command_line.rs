@@ -104,7 +104,7 @@ fn a_run_that_nobody_talks_to_ends_with_its_own_exit_code() {
     command.env("RCWM_PREFIX", link.prefix());
     command.args(["run", "--instance", "silent", "--timeout", "0.3", "--bundle"]).arg(smallest_bundle());
     let error = error_of(&mut command, 3);
-    assert!(error.contains("rcwm-simulator serve --instance silent"), "{error}");
+    assert!(error.contains("rcwm-simulator serve --task TASK --instance silent"), "{error}");
 }
 
 #[test]
