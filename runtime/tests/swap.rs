@@ -265,7 +265,7 @@ fn nobody_at_the_server_is_one_line_that_says_what_to_do() {
     let stop = AtomicBool::new(false);
     let error = ask(&link.0, &smallest_bundle(), When::Now, None, &stop, &mut |_| {}).unwrap_err();
     let line = error.to_string();
-    assert!(line.contains("rcwm-runtime run --instance test") && !line.contains('\n'), "{line}");
+    assert!(line.contains("rcwm-runtime run --bundle DIR --instance test") && !line.contains('\n'), "{line}");
 }
 
 #[test]
