@@ -15,7 +15,7 @@ use rcwm_gpu::{Machine, Precision};
 use rcwm_models::settings::{ModelKind, ModelSettings, Preset};
 use rcwm_models::{ACTION_LEN, IMAGE_BYTES, MASK_BYTES};
 use rcwm_trainer::behaviour::{BehaviourLearner, BehaviourSettings, Horizon};
-use rcwm_trainer::gpu::{GpuLearner, GpuPlan, numbered_noise};
+use rcwm_trainer::gpu::{GpuLearner, GpuPlan, Share, numbered_noise};
 use rcwm_trainer::learning::{HostBatch, Trained, WorldLearner, WorldSettings, world_losses};
 use rcwm_trainer::model::agent::{self, Agent};
 use rcwm_trainer::model::latent::Sampler;
@@ -64,7 +64,8 @@ fn plan<'a>(
         world,
         behaviour,
         average_decay: 0.0,
-        stored: (0, false),
+        stored: &[],
+        looks: false,
         mode: false,
     }
 }
@@ -95,7 +96,7 @@ fn close(what: &str, found: f64, expected: f64, tolerance: f64) {
 /// Gradients on the machine by name.
 fn gradients(learner: &mut GpuLearner) -> BTreeMap<String, Vec<f32>> {
     let learner = learner.learner_mut();
-    let names: Vec<String> = learner.weights().entries().iter().map(|entry| entry.name.clone()).collect();
+    let names: Vec<String> = learner.entries().iter().map(|entry| entry.name.clone()).collect();
     let gradient = |(at, name)| (name, learner.get(Array::Gradients, at).unwrap());
     names.into_iter().enumerate().map(gradient).collect()
 }
@@ -116,11 +117,17 @@ fn compare(
     };
     let parameters = lively_parameters(&model);
     let copy = parameters.copied().unwrap();
-    let mut gpu = GpuLearner::new(machine, &plan(&model, &world, Some(&behaviour)), &copy).unwrap();
+    // Where not all steps are decoded, the encoders see other pictures, too.
+    let looks = decode_every > 1;
+    let plan = GpuPlan { looks, ..plan(&model, &world, Some(&behaviour)) };
+    let mut gpu = GpuLearner::new(&Share::alone(machine), &plan, &copy).unwrap();
     let mut cpu = WorldLearner::new(&parameters, &model, &world, Trained::World).unwrap();
     let mut actor = BehaviourLearner::new(&parameters, &model, &behaviour).unwrap();
     for number in 0..3u64 {
-        let host = batch(ROWS, LENGTH, masks, number);
+        let mut host = batch(ROWS, LENGTH, masks, number);
+        if looks {
+            host.seen = host.image.iter().map(|x| 255 - x / 2).collect();
+        }
         let found = gpu.update_world(&host, numbered_noise(SEED, number)).unwrap();
         let on_machine = gradients(&mut gpu);
         let mut sampler = Sampler::numbered(SEED, number);
@@ -197,7 +204,7 @@ fn gradients_on(machine: Machine, kind: ModelKind) -> (BTreeMap<String, Vec<f32>
     let model = ModelSettings::preset(Preset::Debug, kind);
     let world = WorldSettings { decode_every: 1, ..WorldSettings::default() };
     let parameters = lively_parameters(&model);
-    let mut gpu = GpuLearner::new(machine, &plan(&model, &world, None), &parameters).unwrap();
+    let mut gpu = GpuLearner::new(&Share::alone(machine), &plan(&model, &world, None), &parameters).unwrap();
     gpu.update_world(&batch(ROWS, LENGTH, true, 0), numbered_noise(SEED, 0)).unwrap();
     let commands = gpu.learner_mut().commands().0;
     (gradients(&mut gpu), commands)
@@ -218,7 +225,7 @@ fn validation_is_of_the_average_that_a_checkpoint_holds() {
     let world = WorldSettings::default();
     let weights = lively_parameters(&model);
     let plan = GpuPlan { average_decay: 0.9, ..plan(&model, &world, None) };
-    let mut gpu = GpuLearner::new(Machine::host(), &plan, &weights).unwrap();
+    let mut gpu = GpuLearner::new(&Share::alone(Machine::host()), &plan, &weights).unwrap();
     for number in 0..4 {
         gpu.update_world(&batch(ROWS, LENGTH, false, number), numbered_noise(SEED, number)).unwrap();
     }
@@ -244,14 +251,15 @@ fn sizes_that_kernels_do_not_take_are_refused_by_name() {
     let model = ModelSettings { cnn_depth: 6, ..ModelSettings::preset(Preset::Debug, ModelKind::Rcwm) };
     let weights = agent::initialise(&model, 1, &Device::Cpu).unwrap();
     let world = WorldSettings::default();
-    let refused = GpuLearner::new(Machine::host(), &plan(&model, &world, None), &weights);
+    let refused = GpuLearner::new(&Share::alone(Machine::host()), &plan(&model, &world, None), &weights);
     assert!(refused.unwrap_err().to_string().contains("cnn_depth = 6"));
 }
 
 #[test]
 fn programs_give_the_authors_numbers() {
     let file = std::path::Path::new(env!("CARGO_MANIFEST_DIR")).join("../tests/data/rcwm-small.safetensors");
-    let report = parity::check_programs(&file, &Group::ALL, Machine::host(), &mut |_| ()).unwrap();
+    let report =
+        parity::check_programs(&file, &Group::ALL, &Share::alone(Machine::host()), &mut |_| ()).unwrap();
     assert_eq!(report.groups.len(), 6);
     for group in &report.groups {
         assert!(group.passes(), "{}: {:?}", group.group.as_str(), group.worst());

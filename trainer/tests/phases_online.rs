@@ -19,6 +19,7 @@ use rcwm_models::settings::{ModelKind, Preset};
 use rcwm_models::wire::{LinkSettings, ObservationFlags, SimulatorLink, Wait};
 use rcwm_trainer::acting::{Policy, PolicyInput, filter_step};
 use rcwm_trainer::checkpoint::Checkpoint;
+use rcwm_trainer::gpu::Share;
 use rcwm_trainer::model::agent::Agent;
 use rcwm_trainer::model::latent::{FirstSteps, Sampler};
 use rcwm_trainer::model::parameters::Parameters;
@@ -162,7 +163,7 @@ fn the_policy_acts_in_all_simulators_and_learns_as_the_ratio_says() {
     let cases = [
         (ModelKind::Rcwm, Compute::from(&Device::Cpu)),
         (ModelKind::Vanilla, Compute::from(&Device::Cpu)),
-        (ModelKind::Rcwm, Compute::Programs(Machine::host())),
+        (ModelKind::Rcwm, Compute::Programs(Share::alone(Machine::host()))),
     ];
     for (kind, compute) in cases {
         let folder = tempfile::tempdir().unwrap();
@@ -206,7 +207,7 @@ fn a_resumed_run_has_its_weights_counters_and_replay_back() {
 
 #[test]
 fn a_resumed_run_of_programs_has_them_back_too() {
-    resumed_has_everything_back(|| Compute::Programs(Machine::host()));
+    resumed_has_everything_back(|| Compute::Programs(Share::alone(Machine::host())));
 }
 
 fn resumed_has_everything_back(compute: impl Fn() -> Compute) {

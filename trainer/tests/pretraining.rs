@@ -12,6 +12,8 @@ use rcwm_gpu::{Machine, Precision};
 use rcwm_models::episode::Episode;
 use rcwm_models::settings::{ModelKind, Preset};
 use rcwm_trainer::checkpoint::Checkpoint;
+use rcwm_trainer::gpu::Share;
+use rcwm_trainer::learning::LookSettings;
 use rcwm_trainer::model::parameters::Parameters;
 use rcwm_trainer::replay::Replay;
 use rcwm_trainer::training::{
@@ -27,6 +29,8 @@ fn episode(steps: usize, shift: usize, masked: bool) -> Episode {
             |(t, y, x, _)| if inside(t, y, x) { 220 } else { 30 },
         ),
         action: Array2::from_shape_fn((steps, 4), |(t, _)| if t == 0 { 0.0 } else { 0.5 }),
+        disturbed: masked
+            .then(|| Array4::from_shape_fn((steps, 64, 64, 3), |(t, y, _, c)| (t + 3 * y + 40 * c) as u8)),
         reward: (0..steps).map(|t| t as f32 * 0.1).collect(),
         robot_mask: masked.then(|| Array3::from_shape_fn((steps, 64, 64), |(t, y, x)| inside(t, y, x))),
         ..Episode::blank(steps)
@@ -88,7 +92,7 @@ fn tensors() -> Compute {
 }
 
 fn programs() -> Compute {
-    Compute::Programs(Machine::host())
+    Compute::Programs(Share::alone(Machine::host()))
 }
 
 #[test]
@@ -104,19 +108,33 @@ fn a_resumed_run_of_programs_gives_the_same_weights_too() {
 #[test]
 fn a_resumed_run_on_a_gpu_gives_the_same_weights_too() {
     match Machine::nvidia(0, Precision::F32) {
-        Ok(_) => {
-            resumed_is_the_same_as_whole(|| Compute::Programs(Machine::nvidia(0, Precision::F32).unwrap()))
-        }
+        Ok(_) => resumed_is_the_same_as_whole(|| {
+            Compute::Programs(Share::alone(Machine::nvidia(0, Precision::F32).unwrap()))
+        }),
         Err(error) => eprintln!("not run: no GPU ({error})"),
     }
 }
 
 #[test]
 fn programs_learn_what_tensors_learn() {
+    programs_are_like_tensors(LookSettings::default());
+}
+
+#[test]
+fn programs_see_the_scene_disturbed_as_tensors_do() {
+    let plain = programs_are_like_tensors(LookSettings::default());
+    let disturbed = programs_are_like_tensors(LookSettings { disturbed: 0.5, jitter: 0.0 });
+    let coloured = programs_are_like_tensors(LookSettings { disturbed: 0.5, jitter: 0.5 });
+    assert!(plain != disturbed && disturbed != coloured);
+}
+
+/// Trains both ways; the loss of the first updates.
+fn programs_are_like_tensors(look: LookSettings) -> f64 {
     let folder = tempfile::tempdir().unwrap();
     let run = |name: &str, compute: Compute| {
-        let mut training =
-            Pretraining::create(&folder.path().join(name), settings(ModelKind::Rcwm, 7), compute).unwrap();
+        let mut settings = settings(ModelKind::Rcwm, 7);
+        settings.replay.look = look;
+        let mut training = Pretraining::create(&folder.path().join(name), settings, compute).unwrap();
         train(&mut training);
         (lines(&folder.path().join(name), false), lines(&folder.path().join(name), true))
     };
@@ -132,6 +150,7 @@ fn programs_learn_what_tensors_learn() {
         assert!((found - expected).abs() <= tolerance * expected.abs(), "{found}, expected {expected}");
     }
     assert_eq!(tensors.0.len(), programs.0.len());
+    programs.0[0]["losses"]["total"].as_f64().unwrap()
 }
 
 fn resumed_is_the_same_as_whole(compute: impl Fn() -> Compute) {
@@ -159,6 +178,93 @@ fn resumed_is_the_same_as_whole(compute: impl Fn() -> Compute) {
         assert!(stored(&halves) == stored(&whole), "{kind:?}: not the same average");
         assert!(stored(&halves) == bits(&second.ema_weights()) && stored(&halves) != expected);
     }
+}
+
+/// Runs of these seeds, numbers of updates and folders, each in a thread of its own; what they have learned.
+fn learn_together(
+    runs: &[(u64, u64, &Path)],
+    computes: Vec<Compute>,
+) -> Vec<(Vec<(String, Vec<u32>)>, serde_json::Value)> {
+    std::thread::scope(|scope| {
+        let thread = |(&(seed, updates, folder), compute): (&(u64, u64, &Path), Compute)| {
+            let (folder, compute) = (folder.to_owned(), compute);
+            scope.spawn(move || {
+                let settings = TrainingSettings { seed, ..settings(ModelKind::Rcwm, updates) };
+                let mut training = if folder.join("settings.toml").exists() {
+                    Pretraining::resume(&folder, settings, compute).unwrap()
+                } else {
+                    Pretraining::create(&folder, settings, compute).unwrap()
+                };
+                train(&mut training);
+                let newest = lines(&folder, true).last().unwrap()["held_out"].clone();
+                (bits(training.parameters()), newest)
+            })
+        };
+        let threads: Vec<_> = runs.iter().zip(computes).map(thread).collect();
+        threads.into_iter().map(|thread| thread.join().unwrap()).collect()
+    })
+}
+
+/// Three runs of which one is shorter, and one begins where it was stopped before: they ask for different updates at once.
+fn alone_and_together(
+    machine: impl Fn() -> Machine,
+) -> [Vec<(Vec<(String, Vec<u32>)>, serde_json::Value)>; 2] {
+    let folder = tempfile::tempdir().unwrap();
+    let path = |name: &str| folder.path().join(name);
+    let runs = [(1, 12), (2, 7), (3, 12)];
+    let alone = runs.map(|(seed, updates)| {
+        let run = [(seed, updates, &*path(&format!("alone-{seed}")))];
+        learn_together(&run, Compute::programs(machine())).remove(0)
+    });
+    learn_together(&[(3, 3, &path("together-3"))], Compute::programs(machine()));
+    let folders = runs.map(|(seed, _)| path(&format!("together-{seed}")));
+    let runs: Vec<_> =
+        runs.iter().zip(&folders).map(|((seed, updates), folder)| (*seed, *updates, &**folder)).collect();
+    let together = learn_together(&runs, Compute::programs(machine().for_runs(3)));
+    [alone.to_vec(), together]
+}
+
+#[test]
+fn runs_that_learn_together_learn_what_each_learns_alone() {
+    let [alone, together] = alone_and_together(Machine::host);
+    assert!(alone == together, "not the same bits");
+    assert!(alone[0].0 != alone[2].0, "seeds differ");
+}
+
+#[test]
+fn runs_that_learn_together_on_a_gpu_do_too() {
+    match Machine::nvidia(0, Precision::F32) {
+        Ok(_) => {
+            // Other products are chosen for several runs: they may round otherwise.
+            let [alone, together] = alone_and_together(|| Machine::nvidia(0, Precision::F32).unwrap());
+            for ((_, alone), (_, together)) in alone.iter().zip(&together) {
+                let total = |values: &serde_json::Value| values["total"].as_f64().unwrap();
+                let (found, expected) = (total(together), total(alone));
+                assert!((found - expected).abs() <= 1e-2 * expected, "{found}, expected {expected}");
+            }
+        }
+        Err(error) => eprintln!("not run: no GPU ({error})"),
+    }
+}
+
+#[test]
+fn runs_of_other_settings_do_not_learn_together() {
+    let folder = tempfile::tempdir().unwrap();
+    let mut computes = Compute::programs(Machine::host().for_runs(2)).into_iter();
+    let run = |name: &str, reward_scale: f64, compute: Compute| {
+        let mut settings = settings(ModelKind::Rcwm, 2);
+        settings.world.reward_scale = reward_scale;
+        let mut training = Pretraining::create(&folder.path().join(name), settings, compute).unwrap();
+        training.run(replay(), &AtomicBool::new(false), |_| ()).map(|outcome| outcome.updates)
+    };
+    std::thread::scope(|scope| {
+        let (first, second) = (computes.next().unwrap(), computes.next().unwrap());
+        let threads = [scope.spawn(|| run("first", 1.0, first)), scope.spawn(|| run("second", 2.0, second))];
+        let results = threads.map(|thread| thread.join().unwrap());
+        let refused: Vec<_> = results.iter().filter_map(|result| result.as_ref().err()).collect();
+        assert_eq!(refused.len(), 1, "whoever comes first learns, alone");
+        assert!(refused[0].to_string().contains("differ in more than their seed"), "{}", refused[0]);
+    });
 }
 
 #[test]

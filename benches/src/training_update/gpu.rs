@@ -1,14 +1,16 @@
 //! The same updates on a GPU: whole updates as they are replayed, and their parts run command by command.
 
-use std::sync::Barrier;
+use std::sync::{Arc, Barrier};
 use std::time::{Duration, Instant};
 
 use anyhow::{Context, Result, anyhow};
 use candle_core::Device;
 use rcwm_gpu::{Machine, Precision};
-use rcwm_trainer::gpu::{GpuLearner, GpuPlan, numbered_noise};
+use rcwm_models::episode::Episode;
+use rcwm_trainer::gpu::{GpuLearner, GpuPlan, Share, numbered_noise};
 use rcwm_trainer::learning::WorldSettings;
 use rcwm_trainer::model::agent;
+use rcwm_trainer::replay::Placed;
 use serde::Serialize;
 
 use crate::case::{Case, behaviour_settings, host_batch};
@@ -24,6 +26,8 @@ pub struct GpuReport {
     pub horizon: usize,
     /// Learners of different seeds that shared the card.
     pub together: usize,
+    /// Whether each had programs of its own.
+    pub apart: bool,
     pub updates: usize,
     /// Compiling the kernels, laying out the programs and capturing them.
     pub prepare_ms: f64,
@@ -66,21 +70,29 @@ pub struct GpuPart {
 /// Updates of the world model alone that are made at once, for each that is timed by itself.
 const ALONE: u32 = 5;
 
-/// Measures a case on the GPU of this number, with so many learners at once.
+/// Measures a case on the GPU of this number, with so many learners at once: in programs that all share, or each with its own.
 pub fn measure(
     case: &Case,
     ordinal: usize,
     precision: Precision,
-    (updates, together): (u32, usize),
+    (updates, together, apart): (u32, usize, bool),
     commands_shown: usize,
 ) -> Result<GpuReport> {
+    let machine = || Ok::<_, anyhow::Error>(Machine::nvidia(ordinal, precision)?);
+    let shares = if apart {
+        (0..together).map(|_| Ok(Share::alone(machine()?))).collect::<Result<Vec<_>>>()?
+    } else {
+        Share::all(machine()?.for_runs(together))
+    };
     let barrier = Barrier::new(together);
     let found: Vec<Result<One>> = std::thread::scope(|scope| {
-        let threads: Vec<_> = (0..together)
-            .map(|seed| {
+        let threads: Vec<_> = shares
+            .iter()
+            .enumerate()
+            .map(|(seed, share)| {
                 scope.spawn({
                     let barrier = &barrier;
-                    move || one(case, ordinal, precision, updates, (seed as u64, commands_shown), barrier)
+                    move || one(case, share, updates, (seed as u64, commands_shown), barrier)
                 })
             })
             .collect();
@@ -117,6 +129,7 @@ pub fn measure(
         length: case.scale.length,
         horizon: case.scale.horizon,
         together,
+        apart,
         updates: updates as usize,
         prepare_ms: 1e3 * first.prepare.as_secs_f64(),
         world_median_ms: at(&first.world, 0.5),
@@ -146,14 +159,13 @@ struct One {
 
 fn one(
     case: &Case,
-    ordinal: usize,
-    precision: Precision,
+    share: &Share,
     updates: u32,
     (seed, commands_shown): (u64, usize),
     barrier: &Barrier,
 ) -> Result<One> {
     let start = Instant::now();
-    let made = make(case, ordinal, precision, seed);
+    let made = make(case, share, seed);
     let prepare = start.elapsed();
     barrier.wait();
     let (mut learner, images) = made?;
@@ -211,8 +223,8 @@ fn one(
         }
     }
     let inner = learner.learner_mut();
-    let (card, commands, memory_bytes) =
-        (inner.machine().name(), inner.commands(), inner.machine().allocated());
+    let (card, memory_bytes) = inner.machine();
+    let commands = inner.commands();
     Ok(One {
         card,
         prepare,
@@ -227,22 +239,26 @@ fn one(
 }
 
 /// A learner whose images lie on the card, and which of them the batch has.
-fn make(case: &Case, ordinal: usize, precision: Precision, seed: u64) -> Result<(GpuLearner, Vec<u32>)> {
-    let machine = Machine::nvidia(ordinal, precision)?;
+fn make(case: &Case, share: &Share, seed: u64) -> Result<(GpuLearner, Vec<u32>)> {
     let parameters = agent::initialise(&case.settings, seed, &Device::Cpu)?;
     let (world, behaviour) = (WorldSettings::default(), behaviour_settings(case.scale));
     let count = case.scale.batch * case.scale.length;
+    let mut episode = Episode::blank(count);
+    for (to, from) in episode.image.iter_mut().zip(host_batch(case.scale).image) {
+        *to = from;
+    }
+    let placed = Placed { episode: Arc::new(episode), images: 0, seen: 0 };
     let plan = GpuPlan {
         model: &case.settings,
         batch: (case.scale.batch, case.scale.length),
         world: &world,
         behaviour: Some(&behaviour),
         average_decay: 0.0,
-        stored: (count, false),
+        stored: &[placed],
+        looks: false,
         mode: false,
     };
-    let mut learner = GpuLearner::new(machine, &plan, &parameters)?;
-    learner.learner_mut().store(0, &host_batch(case.scale).image, &[])?;
+    let learner = GpuLearner::new(share, &plan, &parameters)?;
     Ok((learner, (0..count as u32).collect()))
 }
 
@@ -250,7 +266,7 @@ impl GpuReport {
     /// The table.
     pub fn print(&self) {
         rcwm_models::outln!(
-            "{} on {}, {}: batch {} x {}, imagination {}; {} learners; {} updates; prepared in {:.0} ms; memory {:.0} MB",
+            "{} on {}, {}: batch {} x {}, imagination {}; {} learners{}; {} updates; prepared in {:.0} ms; memory {:.0} MB",
             self.name,
             self.card,
             self.precision,
@@ -258,6 +274,7 @@ impl GpuReport {
             self.length,
             self.horizon,
             self.together,
+            if self.apart { " with programs of their own" } else { "" },
             self.updates,
             self.prepare_ms,
             self.memory_mbyte,

@@ -50,6 +50,9 @@ struct Arguments {
     /// Learners at once on a GPU
     #[arg(long, value_name = "N", default_value_t = 1, value_parser = clap::value_parser!(u32).range(1..=16))]
     together: u32,
+    /// Each learner with programs of its own, in place of one program for all
+    #[arg(long)]
+    apart: bool,
     /// So many of the dearest kinds of commands on a GPU
     #[arg(long, value_name = "N", default_value_t = 0)]
     commands: usize,
@@ -147,7 +150,7 @@ fn on_gpu(arguments: &Arguments, results: &mut Results) -> Result<()> {
             case.scale.batch = batch;
             for precision in &arguments.precision {
                 let together = arguments.together as usize;
-                let many = (arguments.updates, together);
+                let many = (arguments.updates, together, arguments.apart);
                 let report = gpu::measure(&case, 0, (*precision).into(), many, arguments.commands)?;
                 report.print();
                 results.gpu.push(report);

@@ -20,7 +20,7 @@ NO_UNROLL
 // One-hot draws from categoricals: argmax of log p + noise, p with its uniform share; without noise (p[1] null) the mode.
 // p: logits, gumbel, z. n: rows, categoricals, classes, stride of logits, of z, T, B: noise of row t * B + b is that of b * T + t. f: unimix.
 KERNEL(draw) {
-    const float *logits = (const float *)AT(0), *gumbel = (const float *)AT(1);
+    const float *logits = (const float *)AT(0), *gumbel = (const float *)OR_NULL(1);
     float *z = (float *)AT(2);
     int n = a.n[1], m = a.n[2];
     Team t = team(0);

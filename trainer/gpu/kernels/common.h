@@ -6,9 +6,11 @@
 #define RCWM_COMMON_H
 
 // Arguments of every kernel: addresses, counts and factors, in the order that the kernel's comment names. Counts are 32 bits wide, which GPUs
-// divide by quickly; no buffer holds 2^31 numbers.
+// divide by quickly; no buffer holds 2^31 numbers. Runs that learn together have memory of their own, `apart` times 256 bytes from one to the
+// next (0: the same for all), and blocks of their own.
 typedef struct {
     void *p[16];
+    unsigned int apart[16];
     int n[16];
     float f[8];
 } Args;
@@ -26,7 +28,8 @@ typedef unsigned char u8;
 // A function of its own: what is called from many places and runs a few times from each would take long to load as instructions.
 #define DEVICE_CALL static __device__ __noinline__
 #define IN_SHARED(at) __builtin_assume(__isShared(at))
-#define AT(i) in_global(a.p[i])
+#define AT(i) in_global(of_this_run(a, i))
+#define OR_NULL(i) (a.p[i] ? of_this_run(a, i) : 0)
 #define THREAD ((int)threadIdx.x)
 #define THREADS ((int)blockDim.x)
 #define LANES 32
@@ -43,6 +46,7 @@ typedef unsigned char u8;
 #define DEVICE_CALL static inline
 #define IN_SHARED(at)
 #define AT(i) (a.p[i])
+#define OR_NULL(i) (a.p[i])
 #define THREAD 0
 #define THREADS 1
 #define LANES 1
@@ -63,6 +67,8 @@ typedef struct {
 #endif
 
 #ifdef __CUDACC__
+DEVICE void *of_this_run(const Args &a, int i) { return (u8 *)a.p[i] + 256ul * a.apart[i] * blockIdx.y; }
+
 // An address that kernels are given, also where the compiler does not see by whom.
 DEVICE void *in_global(void *at) {
     __builtin_assume(__isGlobal(at));

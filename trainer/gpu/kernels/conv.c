@@ -7,8 +7,8 @@
 KERNEL(windows) {
     u32 channels = (u32)a.n[2];
     if (channels % 4 == 0) {
-        const Four *x = (const Four *)a.p[0];
-        Four *y = (Four *)a.p[1];
+        const Four *x = (const Four *)AT(0);
+        Four *y = (Four *)AT(1);
         u32 side = (u32)a.n[1], half = side / 2, fours = channels / 4, width = 16 * fours;
         u32 at_once = THREADS > (int)width ? (u32)THREADS / width : 1;
         for (int group = BLOCK; (u32)group * at_once < (u32)a.n[0] * half * half; group += BLOCKS) {
@@ -27,8 +27,8 @@ KERNEL(windows) {
         }
         return;
     }
-    const float *x = (const float *)a.p[0];
-    float *y = (float *)a.p[1];
+    const float *x = (const float *)AT(0);
+    float *y = (float *)AT(1);
     u32 side = (u32)a.n[1], half = side / 2;
     FOR_ALL(at, a.n[0] * half * half * 16) {
         u32 i = (u32)at, tap = i % 16, place = i / 16;
@@ -42,8 +42,8 @@ KERNEL(windows) {
 // The sum of windows over the places they were cut from: x [images, side, side, channels] of windows of its half-sized map.
 // p: windows, x, bias [channels] or null. n: images, side, channels (a multiple of 4), add.
 KERNEL(from_windows) {
-    const Four *windows = (const Four *)a.p[0], *bias = (const Four *)a.p[2];
-    Four *x = (Four *)a.p[1];
+    const Four *windows = (const Four *)AT(0), *bias = (const Four *)OR_NULL(2);
+    Four *x = (Four *)AT(1);
     u32 side = (u32)a.n[1], half = side / 2, fours = (u32)a.n[2] / 4;
     FOR_ALL(at, a.n[0] * side * side * fours) {
         u32 i = (u32)at, c = i % fours, place = i / fours, column = place % side, row = place / side % side;
@@ -74,27 +74,53 @@ KERNEL(from_windows) {
     }
 }
 
+// Where a pixel comes from that is at `at` [64, 64, channels] of a picture that was moved by `by` (right, down; null: not at all).
+DEVICE int moved_from(int at, int channels, const int *by) {
+    int column = at / channels % 64, row = at / channels / 64;
+    if (by) {
+        column -= by[0];
+        row -= by[1];
+        column = column < 0 ? 0 : column > 63 ? 63 : column;
+        row = row < 0 ? 0 : row > 63 ? 63 : row;
+    }
+    return row * 64 + column;
+}
+
 // Images of a store of u8 [.., 64, 64, 3] by index, shifted by row of the batch, as x / 255 - 0.5.
 // p: store, index (u32) [count], shift (int: right, down) [B, 2] or null, out. n: count, B, channels.
 // Where n[3] a mask is copied: u8 to u8.
 KERNEL(gather_images) {
-    const u8 *store = (const u8 *)a.p[0];
-    const u32 *index = (const u32 *)a.p[1];
-    const int *shift = (const int *)a.p[2];
+    const u8 *store = (const u8 *)AT(0);
+    const u32 *index = (const u32 *)AT(1);
+    const int *shift = (const int *)OR_NULL(2);
     u32 channels = (u32)a.n[2], pixels = 64 * 64 * channels;
     FOR_ALL(i, a.n[0] * pixels) {
         u32 image = (u32)(i / pixels), at = (u32)(i % pixels), c = at % channels;
-        int column = (int)(at / channels % 64), row = (int)(at / channels / 64);
-        if (shift) {
-            const int *by = shift + 2 * (image % a.n[1]);
-            column -= by[0];
-            row -= by[1];
-            column = column < 0 ? 0 : column > 63 ? 63 : column;
-            row = row < 0 ? 0 : row > 63 ? 63 : row;
+        u32 from = (u32)moved_from((int)at, (int)channels, shift ? shift + 2 * (image % a.n[1]) : 0);
+        u8 value = store[(long)index[image] * pixels + from * channels + c];
+        if (a.n[3]) ((u8 *)AT(3))[i] = value;
+        else ((float *)AT(3))[i] = (float)value / 255.0f - 0.5f;
+    }
+}
+
+// The same with other colours by row of the batch, rounded to what a byte holds: gain * (x + grey * (mean of the colours - x)) + offset.
+// p: store, index (u32) [count], shift [B, 2], colours [B, 8] (gain [3], offset [3], grey, whether any changes), out. n: count, B.
+KERNEL(gather_seen) {
+    const u8 *store = (const u8 *)AT(0);
+    const u32 *index = (const u32 *)AT(1);
+    const int *shift = (const int *)AT(2);
+    const float *colours = (const float *)AT(3);
+    float *out = (float *)AT(4);
+    FOR_ALL(i, a.n[0] * 4096) {
+        u32 image = i / 4096, sequence = image % (u32)a.n[1];
+        const u8 *pixel = store + 3 * ((long)index[image] * 4096 + moved_from((int)(i % 4096), 1, shift + 2 * sequence));
+        const float *of = colours + 8 * sequence;
+        float mean = ((float)pixel[0] + (float)pixel[1] + (float)pixel[2]) / 3.0f;
+        for (int c = 0; c < 3; c++) {
+            float x = (float)pixel[c];
+            if (of[7] != 0.0f) x = fminf(fmaxf(roundf(of[c] * (x + of[6] * (mean - x)) + of[3 + c]), 0.0f), 255.0f);
+            out[3 * i + c] = x / 255.0f - 0.5f;
         }
-        u8 value = store[(long)index[image] * pixels + ((u32)row * 64 + (u32)column) * channels + c];
-        if (a.n[3]) ((u8 *)a.p[3])[i] = value;
-        else ((float *)a.p[3])[i] = (float)value / 255.0f - 0.5f;
     }
 }
 
@@ -102,10 +128,10 @@ KERNEL(gather_images) {
 // p: raw robot [count, 64, 64, 4], raw environment (or null: one branch), image (float), mask (u8, or null), row (u32 [count]: which image; or
 // null), loss [count], mask loss [count], d robot, d environment. n: count. f: weight, mask weight.
 KERNEL(picture_loss) {
-    const float *raw[2] = {(const float *)a.p[0], (const float *)a.p[1]}, *image = (const float *)a.p[2];
-    const u8 *mask = (const u8 *)a.p[3];
-    const u32 *rows = (const u32 *)a.p[4];
-    float *d[2] = {(float *)a.p[7], (float *)a.p[8]};
+    const float *raw[2] = {(const float *)AT(0), (const float *)OR_NULL(1)}, *image = (const float *)AT(2);
+    const u8 *mask = (const u8 *)OR_NULL(3);
+    const u32 *rows = (const u32 *)OR_NULL(4);
+    float *d[2] = {(float *)AT(7), (float *)OR_NULL(8)};
     for (int at = BLOCK; at < a.n[0]; at += BLOCKS) {
         int source = (rows ? (int)rows[at] : at) * 4096;
         float loss = 0.0f, mask_loss = 0.0f;
@@ -141,8 +167,8 @@ KERNEL(picture_loss) {
         loss = block_sum(loss);
         mask_loss = block_sum(mask_loss);
         if (THREAD == 0) {
-            ((float *)a.p[5])[at] = loss;
-            if (mask) ((float *)a.p[6])[at] = mask_loss;
+            ((float *)AT(5))[at] = loss;
+            if (mask) ((float *)AT(6))[at] = mask_loss;
         }
     }
 }

@@ -19,9 +19,9 @@ DEVICE Row row_of(const float *x, int width, int lane, int lanes) {
 // (factor * weight * (softmax - target)), added to loss and gradient where n[3].
 // p: logits, value, weight, bins, loss, d_logits. n: rows, bins, stride of value, add. f: factor.
 KERNEL(two_hot_loss) {
-    const float *logits = (const float *)a.p[0], *values = (const float *)a.p[1], *weights = (const float *)a.p[2];
-    const float *bins = (const float *)a.p[3];
-    float *loss = (float *)a.p[4], *dx = (float *)a.p[5];
+    const float *logits = (const float *)AT(0), *values = (const float *)AT(1), *weights = (const float *)OR_NULL(2);
+    const float *bins = (const float *)AT(3);
+    float *loss = (float *)AT(4), *dx = (float *)AT(5);
     int width = a.n[1];
     float spacing = bins[1] - bins[0];
     Team t = team(0);
@@ -43,8 +43,8 @@ KERNEL(two_hot_loss) {
 // Mean of the distribution over bins as a value, symexp(sum p_j bins_j), summed in pairs around the middle; or its gradient (n[2]).
 // p: logits, bins, value [rows]; backward also d_value, d_logits. n: rows, bins, backward.
 KERNEL(two_hot_mean) {
-    const float *logits = (const float *)a.p[0], *bins = (const float *)a.p[1], *d_value = (const float *)a.p[3];
-    float *value = (float *)a.p[2], *dx = (float *)a.p[4];
+    const float *logits = (const float *)AT(0), *bins = (const float *)AT(1), *d_value = (const float *)AT(3);
+    float *value = (float *)AT(2), *dx = (float *)AT(4);
     int width = a.n[1], half = width / 2;
     Team t = team(0);
     for (int r = t.first; r < a.n[0]; r += t.step) {
@@ -69,22 +69,22 @@ KERNEL(two_hot_mean) {
 // Binary cross-entropy of logits against going on where not `terminal`, with its gradient. p: logits, terminal, loss, d_logits. n: rows.
 // f: factor of the gradient.
 KERNEL(continue_loss) {
-    const float *logits = (const float *)a.p[0], *terminal = (const float *)a.p[1];
+    const float *logits = (const float *)AT(0), *terminal = (const float *)AT(1);
     FOR_ALL(r, a.n[0]) {
         float x = logits[r], goes_on = 1.0f - terminal[r];
         // log(1 + exp(x)) - goes_on x
-        ((float *)a.p[2])[r] = fmaxf(x, 0.0f) + log1pf(expf(-fabsf(x))) - goes_on * x;
-        ((float *)a.p[3])[r] = a.f[0] * (sigmoid_of(x) - goes_on);
+        ((float *)AT(2))[r] = fmaxf(x, 0.0f) + log1pf(expf(-fabsf(x))) - goes_on * x;
+        ((float *)AT(3))[r] = a.f[0] * (sigmoid_of(x) - goes_on);
     }
 }
 
 // factor * sigmoid(x), or its gradient (n[1]). p: x, y; backward x, dy, dx. n: count, backward. f: factor.
 KERNEL(scaled_sigmoid) {
-    const float *x = (const float *)a.p[0];
+    const float *x = (const float *)AT(0);
     FOR_ALL(i, a.n[0]) {
         float s = sigmoid_of(x[i]);
-        if (a.n[1]) ((float *)a.p[2])[i] = ((const float *)a.p[1])[i] * a.f[0] * s * (1.0f - s);
-        else ((float *)a.p[1])[i] = a.f[0] * s;
+        if (a.n[1]) ((float *)AT(2))[i] = ((const float *)AT(1))[i] * a.f[0] * s * (1.0f - s);
+        else ((float *)AT(1))[i] = a.f[0] * s;
     }
 }
 
@@ -92,7 +92,7 @@ KERNEL(scaled_sigmoid) {
 // p: out [rows, 2 actions], normal noise [rows, actions] (null: the mean), action (stride n[2]), entropy [rows].
 // n: rows, actions, stride of action, T, B: noise of row t * B + b is that of b * T + t (T 0: as it is).
 KERNEL(actor_draw) {
-    const float *out = (const float *)a.p[0], *noise = (const float *)a.p[1];
+    const float *out = (const float *)AT(0), *noise = (const float *)AT(1);
     FOR_ALL(r, a.n[0]) {
         float entropy = 0.0f;
         int from = a.n[3] > 0 ? r % a.n[4] * a.n[3] + r / a.n[4] : r;
@@ -100,18 +100,18 @@ KERNEL(actor_draw) {
             float mean = tanhf(out[2 * r * a.n[1] + j]);
             float std = 0.9f * sigmoid_of(out[(2 * r + 1) * a.n[1] + j] + 2.0f) + 0.1f;
             float action = noise ? mean + std * noise[from * a.n[1] + j] : mean;
-            ((float *)a.p[2])[r * a.n[2] + j] = action / fmaxf(1.0f, fabsf(action));
+            ((float *)AT(2))[r * a.n[2] + j] = action / fmaxf(1.0f, fabsf(action));
             entropy += logf(std) + 1.41893853320467274178f;
         }
-        ((float *)a.p[3])[r] = entropy;
+        ((float *)AT(3))[r] = entropy;
     }
 }
 
 // p: out, noise, d_action (stride n[2]), d_entropy [rows], d_out (written). n as above. The divisor gets no gradient.
 KERNEL(actor_backward) {
-    const float *out = (const float *)a.p[0], *noise = (const float *)a.p[1], *d_action = (const float *)a.p[2];
-    const float *d_entropy = (const float *)a.p[3];
-    float *dx = (float *)a.p[4];
+    const float *out = (const float *)AT(0), *noise = (const float *)AT(1), *d_action = (const float *)AT(2);
+    const float *d_entropy = (const float *)AT(3);
+    float *dx = (float *)AT(4);
     FOR_ALL(r, a.n[0]) {
         int from = a.n[3] > 0 ? r % a.n[4] * a.n[3] + r / a.n[4] : r;
         for (int j = 0; j < a.n[1]; j++) {
@@ -127,8 +127,8 @@ KERNEL(actor_backward) {
 // Lambda returns (eq. 10) and step weights of N imaginations of L states, a thread each.
 // p: reward [L, N], value [L, N], discount [L, N], returns [L-1, N], weights [L, N]. n: L, N. f: lambda.
 KERNEL(lambda_returns) {
-    const float *reward = (const float *)a.p[0], *value = (const float *)a.p[1], *discount = (const float *)a.p[2];
-    float *returns = (float *)a.p[3], *weights = (float *)a.p[4];
+    const float *reward = (const float *)AT(0), *value = (const float *)AT(1), *discount = (const float *)AT(2);
+    float *returns = (float *)AT(3), *weights = (float *)AT(4);
     int length = a.n[0], rows = a.n[1];
     FOR_ALL(i, rows) {
         float next = value[(length - 1) * rows + i], weight = 1.0f;
@@ -148,10 +148,10 @@ KERNEL(lambda_returns) {
 // p: reward, value, discount, returns, weights, entropy [L-1, N], range [low, high], loss [L-1, N], d_reward, d_value, d_discount [L, N],
 // d_entropy [L-1, N]. n: L, N. f: lambda, eta, 1 / ((L-1) N).
 KERNEL(actor_loss) {
-    const float *value = (const float *)a.p[1], *discount = (const float *)a.p[2], *returns = (const float *)a.p[3];
-    const float *weights = (const float *)a.p[4], *entropy = (const float *)a.p[5], *range = (const float *)a.p[6];
-    float *loss = (float *)a.p[7], *d_reward = (float *)a.p[8], *d_value = (float *)a.p[9], *d_discount = (float *)a.p[10];
-    float *d_entropy = (float *)a.p[11];
+    const float *value = (const float *)AT(1), *discount = (const float *)AT(2), *returns = (const float *)AT(3);
+    const float *weights = (const float *)AT(4), *entropy = (const float *)AT(5), *range = (const float *)AT(6);
+    float *loss = (float *)AT(7), *d_reward = (float *)AT(8), *d_value = (float *)AT(9), *d_discount = (float *)AT(10);
+    float *d_entropy = (float *)AT(11);
     int length = a.n[0], rows = a.n[1];
     float lambda = a.f[0], scale = fmaxf(1.0f, range[1] - range[0]);
     FOR_ALL(i, rows) {
@@ -195,10 +195,10 @@ static inline float UNORDERED(u32 u) {
 #endif
 
 // Takes two quantiles of x into a running range, by one block: range = (1 - share) range + share quantile. Between neighbours it is linear.
-// p: x, range [low, high]. n: count. f: low, high, share.
+// p: x, range [low, high], whether this run takes part. n: count. f: low, high, share.
 KERNEL(return_range) {
-    const float *x = (const float *)a.p[0];
-    float *range = (float *)a.p[1];
+    const float *x = (const float *)AT(0);
+    float *range = (float *)AT(1);
     for (int which = 0; which < 2; which++) {
         double place = (double)a.f[which] * (double)(a.n[0] - 1);
         int below = (int)place;
@@ -226,6 +226,6 @@ KERNEL(return_range) {
 #endif
         float high = (int)upto > below + 1 || below + 1 >= a.n[0] ? low : next;
         float quantile = low + (high - low) * (float)(place - (double)below);
-        if (THREAD == 0) range[which] = (1.0f - a.f[2]) * range[which] + a.f[2] * quantile;
+        if (THREAD == 0 && *(const u32 *)AT(2)) range[which] = (1.0f - a.f[2]) * range[which] + a.f[2] * quantile;
     }
 }

@@ -165,7 +165,7 @@ KERNEL(interaction_forward) {
         SYNC();
         load(s, in, row == BLOCK, thread, threads);
         attend(s, in, thread, threads);
-        if (AT(13))
+        if (OR_NULL(13))
             for (int i = THREAD; i < s.n * s.m; i += THREADS)
                 ((float *)AT(13))[row * s.n * s.m + i] = s.mix[i / s.m * s.even + i % s.m];
         // z becomes the sum before the norm.
@@ -179,7 +179,7 @@ KERNEL(interaction_forward) {
             for (int j = LANE; j < s.m; j += LANES) squares += (x[j] - mean) * (x[j] - mean);
             float scale = 1.0f / sqrtf(warp_sum(squares) / (float)s.m + a.f[0]);
             for (int j = LANE; j < s.m; j += LANES) {
-                if (AT(14)) ((float *)AT(14))[(row * s.n + y) * s.m + j] = x[j];
+                if (OR_NULL(14)) ((float *)AT(14))[(row * s.n + y) * s.m + j] = x[j];
                 ((float *)AT(12))[row * a.n[6] + y * s.m + j] = (x[j] - mean) * scale * gain[j] + shift[j];
             }
             if (LANE == 0) {
@@ -250,7 +250,7 @@ KERNEL(interaction_backward) {
         SYNC();
         for (int i = THREAD; i < n * m; i += THREADS) dz[i] += d_sum[i / m * even + i % m] + s.z[i / m * even + i % m];
         for (int i = THREAD; i < r * m; i += THREADS) du[i] = s.u[i / m * even + i % m];
-        if (AT(15)) {
+        if (OR_NULL(15)) {
             float *store = (float *)AT(15);
             for (int i = THREAD; i < n * m; i += THREADS) {
                 store[row * n * m + i] = d_sum[i / m * even + i % m];

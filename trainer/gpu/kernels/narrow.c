@@ -18,9 +18,9 @@ DEVICE float back_through_silu(float z, float d) {
 
 // As `norm_forward`, always with SiLU. p: x, gain, shift, y, stats. n: rows, width (4, 8, 16, 32, 64 or 128). f: eps.
 KERNEL(narrow_forward) {
-    const Four *x = (const Four *)a.p[0], *gain = (const Four *)a.p[1], *shift = (const Four *)a.p[2];
-    Four *y = (Four *)a.p[3];
-    float *stats = (float *)a.p[4];
+    const Four *x = (const Four *)AT(0), *gain = (const Four *)AT(1), *shift = (const Four *)AT(2);
+    Four *y = (Four *)AT(3);
+    float *stats = (float *)AT(4);
     int fours = (int)(a.n[1] / 4), lanes = LANES == 1 ? 1 : fours, each = fours / lanes;
     int in_grid = BLOCKS * (THREADS / lanes), rows = (a.n[0] + in_grid - 1) / in_grid * in_grid;
     for (int r = BLOCK * (THREADS / lanes) + THREAD / lanes; r < rows; r += in_grid) {
@@ -57,11 +57,11 @@ KERNEL(narrow_forward) {
 // p: x, gain, shift, stats, dy, dx, partial (null where the gain is frozen). n: rows, width, add to dx. Shared: 8 floats a thread.
 KERNEL(narrow_backward) {
     SHARED(shared);
-    const Four *x = (const Four *)a.p[0], *gain = (const Four *)a.p[1], *shift = (const Four *)a.p[2];
-    const float *stats = (const float *)a.p[3];
-    const Four *dy = (const Four *)a.p[4];
-    Four *dx = (Four *)a.p[5];
-    float *partial = (float *)a.p[6];
+    const Four *x = (const Four *)AT(0), *gain = (const Four *)AT(1), *shift = (const Four *)AT(2);
+    const float *stats = (const float *)AT(3);
+    const Four *dy = (const Four *)AT(4);
+    Four *dx = (Four *)AT(5);
+    float *partial = (float *)OR_NULL(6);
     int fours = (int)(a.n[1] / 4), lanes = LANES == 1 ? 1 : fours, each = fours / lanes;
     int in_grid = BLOCKS * (THREADS / lanes), rows = (a.n[0] + in_grid - 1) / in_grid * in_grid;
 #ifdef __CUDACC__

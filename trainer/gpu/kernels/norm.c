@@ -123,7 +123,7 @@ KERNEL(sum_partials) {
 KERNEL(cell_forward) {
     const float *pre = (const float *)AT(0), *gain = (const float *)AT(1), *shift = (const float *)AT(2);
     const float *h = (const float *)AT(3);
-    float *next = (float *)AT(4), *stats = (float *)AT(5), *again = (float *)AT(6);
+    float *next = (float *)AT(4), *stats = (float *)AT(5), *again = (float *)OR_NULL(6);
     int d = a.n[1], width = 3 * d;
     Team t = team(a.n[5]);
     for (int r = t.first; r < a.n[0]; r += t.step) {
@@ -154,7 +154,7 @@ KERNEL(cell_backward) {
     const float *pre = (const float *)AT(0), *gain = (const float *)AT(1), *shift = (const float *)AT(2);
     const float *h = (const float *)AT(3), *stats = (const float *)AT(4), *d_next = (const float *)AT(5);
     float *d_gates = (float *)AT(6), *d_pre = (float *)AT(7), *d_h = (float *)AT(8);
-    const float *again = (const float *)AT(9);
+    const float *again = (const float *)OR_NULL(9);
     int d = a.n[1], width = 3 * d;
     Team t = team(a.n[6]);
     for (int r = t.first; r < a.n[0]; r += t.step) {

@@ -89,7 +89,7 @@ impl Stepping {
 }
 
 /// Adds an imagination from every row of `start` [N, state], both losses and all gradients of actor and critic. `range` [2] is the returns'
-/// running range, `scalars` takes the means. Noise comes from `control`, from word `word` on, in the order of sequences.
+/// running range, `scalars` takes the means, `taking_part` [1] says whether the run is changed. Noise comes from `control`, from word `word` on, in the order of sequences.
 pub fn losses(
     tape: &mut Tape,
     sources: Sources<'_>,
@@ -97,7 +97,7 @@ pub fn losses(
     scales: &BehaviourScales,
     start: Matrix,
     (control, word): (u64, u64),
-    (range, scalars): (Matrix, Matrix),
+    (range, scalars, taking_part): (Matrix, Matrix, Matrix),
 ) {
     let (n, length) = (start.rows, scales.length);
     let states = tape.matrix(length * n, start.cols);
@@ -119,7 +119,7 @@ pub fn losses(
     tape.program.kernel(Kernel::LambdaReturns, Grid::elements(n), &p, &[length, n], &[scales.lambda]);
     let [low, high] = scales.quantiles;
     let grid = Grid { blocks: 1, threads: 1024, shared_bytes: 0 };
-    let p = [returns, range].map(Pointer::from);
+    let p = [returns, range, taking_part].map(Pointer::from);
     tape.program.kernel(Kernel::ReturnRange, grid, &p, &[steps], &[low, high, scales.range_share]);
     let loss = tape.matrix(steps, 1);
     let d = [reward, value, discount, entropy].map(|x| tape.gradient_overwritten(x));

@@ -10,7 +10,7 @@ macro_rules! each_kernel {
             FillRows fill_rows, CopyRows copy_rows, GatherRows gather_rows, Zero zero, Tanh tanh_of,
             Carry carry, CarryBackward carry_backward, Transpose transpose, SumOf sum_of, Noise noise,
             InteractionForward interaction_forward, InteractionBackward interaction_backward,
-            Windows windows, FromWindows from_windows, GatherImages gather_images, PictureLoss picture_loss,
+            Windows windows, FromWindows from_windows, GatherImages gather_images, GatherSeen gather_seen, PictureLoss picture_loss,
             TwoHotLoss two_hot_loss, TwoHotMean two_hot_mean, ContinueLoss continue_loss, ScaledSigmoid scaled_sigmoid,
             ActorDraw actor_draw, ActorBackward actor_backward, LambdaReturns lambda_returns, ActorLoss actor_loss,
             ReturnRange return_range, Squares squares, Clip clip, Adam adam, Mix mix,

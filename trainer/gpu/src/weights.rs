@@ -133,10 +133,10 @@ impl Weights {
         for array in &mut arrays {
             *array = machine.allocate(4 * end)?;
         }
-        let owners_at = machine.allocate(4 * owners.len())?;
-        machine.upload(owners_at, &owners)?;
-        let bins_at = machine.allocate(4 * bins.len())?;
-        machine.upload(bins_at, bins)?;
+        let owners_at = machine.allocate_shared(4 * owners.len())?;
+        machine.upload(owners_at, 0, &owners)?;
+        let bins_at = machine.allocate_shared(4 * bins.len())?;
+        machine.upload(bins_at, 0, bins)?;
         let bins = Matrix::fixed(bins_at, 1, bins.len());
         Ok(Self { entries, by_name, ranges, arrays, owners: owners_at, bins, deter })
     }
@@ -188,24 +188,29 @@ impl Weights {
         Matrix::fixed(self.arrays[array as usize] + 4 * entry.offset as u64, rows, cols)
     }
 
-    /// Sets a parameter in one of the arrays from numbers in the trainer's order.
+    /// Sets a parameter of a run in one of the arrays from numbers in the trainer's order.
     pub fn set(
         &self,
         machine: &mut Machine,
-        array: Array,
+        (array, run): (Array, usize),
         entry: &Entry,
         values: &[f32],
     ) -> Result<(), GpuError> {
         let address = self.arrays[array as usize] + 4 * entry.offset as u64;
         let mut here = vec![0.0; values.len()];
         self.pairs(entry, |there, place| here[place] = values[there]);
-        machine.upload(address, &here)
+        machine.upload(address, run, &here)
     }
 
-    /// The numbers of a parameter in one of the arrays, in the trainer's order.
-    pub fn get(&self, machine: &mut Machine, array: Array, entry: &Entry) -> Result<Vec<f32>, GpuError> {
+    /// The numbers of a parameter of a run in one of the arrays, in the trainer's order.
+    pub fn get(
+        &self,
+        machine: &mut Machine,
+        (array, run): (Array, usize),
+        entry: &Entry,
+    ) -> Result<Vec<f32>, GpuError> {
         let mut here = vec![0.0; entry.numbers()];
-        machine.download(self.arrays[array as usize] + 4 * entry.offset as u64, &mut here)?;
+        machine.download(self.arrays[array as usize] + 4 * entry.offset as u64, run, &mut here)?;
         let mut values = vec![0.0; here.len()];
         self.pairs(entry, |there, place| values[there] = here[place]);
         Ok(values)

@@ -39,6 +39,10 @@ pub struct Inputs {
     pub masks: u64,
     /// Which image each row has, u32 [T B].
     pub index: u64,
+    /// Which image the encoders see in each row, u32 [T B].
+    pub seen: u64,
+    /// How they see its colours, by sequence: [B, 8], gain [3], offset [3], grey, whether any changes.
+    pub colours: u64,
     /// Shift of each sequence's images, i32 [B, 2]: right, down.
     pub shift: u64,
     /// Actions that led to the images, divided by max(1, |a|) and zero where an episode begins: [T B, action].
@@ -85,7 +89,8 @@ pub fn losses(
     let images = gather(tape, sizes, inputs.images, inputs, 3);
     let masks = masks.then(|| gather(tape, sizes, inputs.masks, inputs, 1));
     tape.program.part("encode");
-    let embeds = encode(tape, source, sizes, images);
+    let seen = if sizes.looks { seen(tape, sizes, inputs) } else { images };
+    let embeds = encode(tape, source, sizes, seen);
     tape.program.part("scan");
     let pairs = scan(tape, source, sizes, inputs, &embeds, features);
     tape.program.part("decode");
@@ -104,6 +109,17 @@ fn gather(tape: &mut Tape, sizes: &Sizes, from: u64, inputs: Inputs, channels: u
     let p = [fixed(from), fixed(inputs.index), fixed(inputs.shift), out.into()];
     let n = [rows, sizes.batch, channels, usize::from(masks)];
     tape.program.kernel(Kernel::GatherImages, Grid::elements(rows * 4096 * channels), &p, &n, &[]);
+    out
+}
+
+/// What the encoders see, as floats [T B 64 64, 3].
+fn seen(tape: &mut Tape, sizes: &Sizes, inputs: Inputs) -> Matrix {
+    let out = tape.matrix(sizes.rows() * 4096, 3);
+    let fixed = |address: u64| Pointer::from(Matrix::fixed(address, 1, 1));
+    let p = [inputs.images, inputs.seen, inputs.shift, inputs.colours].map(fixed);
+    let p = [&p[..], &[out.into()]].concat();
+    let n = [sizes.rows(), sizes.batch];
+    tape.program.kernel(Kernel::GatherSeen, Grid::elements(sizes.rows() * 4096), &p, &n, &[]);
     out
 }
 

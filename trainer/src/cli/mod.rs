@@ -174,7 +174,16 @@ enum PrecisionName {
 }
 
 impl ComputeArguments {
-    fn compute(&self) -> Result<Compute> {
+    /// Where so many runs are computed that learn at once: on a GPU they share programs and images.
+    fn computes(&self, runs: usize) -> Result<Vec<Compute>> {
+        Ok(match self.machine()? {
+            None => (0..runs).map(|_| Compute::Tensors(Device::Cpu)).collect(),
+            Some(machine) => Compute::programs(machine.for_runs(runs)),
+        })
+    }
+
+    /// The GPU that is asked for; none: the CPU.
+    fn machine(&self) -> Result<Option<Machine>> {
         let text = &self.device;
         let precision = match self.precision {
             PrecisionName::F32 => Precision::F32,
@@ -186,12 +195,11 @@ impl ComputeArguments {
                     "--precision is of updates on a GPU: name one with --device cuda, or leave it out"
                 )
             }
-            ("cpu", _) => Ok(Compute::Tensors(Device::Cpu)),
+            ("cpu", _) => Ok(None),
             ("cuda", index) => {
                 let index = index.parse().with_context(|| format!("--device {text}: expected cuda:N"))?;
-                Ok(Compute::Programs(
-                    Machine::nvidia(index, precision).with_context(|| format!("--device {text}"))?,
-                ))
+                let machine = Machine::nvidia(index, precision);
+                Ok(Some(machine.with_context(|| format!("--device {text}"))?))
             }
             _ => anyhow::bail!("--device {text}: expected cpu, cuda or cuda:N"),
         }

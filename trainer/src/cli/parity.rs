@@ -2,8 +2,9 @@ use std::path::PathBuf;
 use std::process::ExitCode;
 
 use anyhow::Result;
+use candle_core::Device;
+use rcwm_trainer::gpu::Share;
 use rcwm_trainer::parity::{self, Group, GroupReport, Measure, Report};
-use rcwm_trainer::training::Compute;
 use serde::Serialize;
 
 /// Compare our model with a reference file of the authors' implementation; exit 1 beyond tolerance
@@ -41,15 +42,15 @@ impl Parity {
     pub fn run(self) -> Result<ExitCode> {
         super::prepare_json(self.json.as_deref())?;
         let groups = if self.groups.is_empty() { Group::ALL.to_vec() } else { self.groups.clone() };
-        let report = match self.compute.compute()? {
-            Compute::Tensors(device) => {
+        let report = match self.compute.machine()? {
+            None => {
                 print_head();
-                parity::check_file(&self.file, &groups, &device, &mut print_group)?
+                parity::check_file(&self.file, &groups, &Device::Cpu, &mut print_group)?
             }
-            Compute::Programs(machine) => {
+            Some(machine) => {
                 rcwm_models::outln!("updates by programs of kernels on {}", machine.name());
                 print_head();
-                parity::check_programs(&self.file, &groups, machine, &mut print_group)?
+                parity::check_programs(&self.file, &groups, &Share::alone(machine), &mut print_group)?
             }
         };
         if let Some(path) = &self.json {

@@ -94,7 +94,7 @@ impl Pretrain {
             settings.iter().all(same),
             "the runs of --seeds learn from different data; resume them one by one"
         );
-        let computes = outs.iter().map(|_| self.compute.compute()).collect::<Result<Vec<_>>>()?;
+        let computes = self.compute.computes(outs.len())?;
         let replay = load(first)?;
         let mut runs = Vec::with_capacity(outs.len());
         for (((out, _), settings), compute) in outs.iter().zip(settings).zip(computes) {

@@ -3,25 +3,29 @@
 //! While a run learns there, its weights and moments live on the GPU; [`GpuLearner::write_back`] brings them to the trainer's parameters before
 //! a checkpoint, a film or an evaluation.
 
+mod share;
+
 use std::collections::BTreeMap;
 
 use candle_core::{Tensor, Var};
 use rand::SeedableRng;
 use rand_chacha::ChaCha8Rng;
-use rcwm_gpu::learner::{AdamScales, Images, Noise};
+use rcwm_gpu::learner::{AdamScales, Colours, Images, Noise, Seen};
 use rcwm_gpu::weights::{Array, Group};
 use rcwm_gpu::world::{Sizes, WorldScales};
-use rcwm_gpu::{BehaviourValues, Learner, LearnerSettings, Machine, WorldValues};
-use rcwm_models::episode::Episode;
+use rcwm_gpu::{BehaviourValues, GpuError, Learner, LearnerSettings, WorldValues};
 use rcwm_models::settings::{ModelKind, ModelSettings};
 
 use crate::behaviour::{BehaviourSettings, BehaviourUpdate, ReturnRange};
 use crate::learning::{
-    Adam, AdamSettings, HostBatch, LearningError, LossValues, Moments, Side, WorldSettings, side_of,
+    Adam, AdamSettings, HostBatch, Jitter, LearningError, LossValues, Moments, Side, WorldSettings, side_of,
 };
 use crate::model::agent;
 use crate::model::parameters::Parameters;
 use crate::ops;
+use crate::replay::Placed;
+
+pub use share::Share;
 
 /// What a learner on a GPU is made for.
 #[derive(Debug, Clone)]
@@ -36,8 +40,10 @@ pub struct GpuPlan<'a> {
     pub behaviour: Option<&'a BehaviourSettings>,
     /// Decay of the running average of the weights; 0: none.
     pub average_decay: f64,
-    /// Images kept on the GPU, and whether their masks are; 0: every batch brings its own.
-    pub stored: (usize, bool),
+    /// Episodes whose images, and masks where they have any, are kept on the GPU; none: every batch brings its own.
+    pub stored: &'a [Placed],
+    /// Whether batches say that the encoders see other pictures than those that are decoded.
+    pub looks: bool,
     /// Whether draws are the most probable class and actions the mean: for comparisons.
     pub mode: bool,
 }
@@ -72,18 +78,19 @@ fn adam_scales(settings: &AdamSettings) -> AdamScales {
 }
 
 impl GpuLearner {
-    /// A learner on `machine`, with these weights and optimisers that have seen nothing.
+    /// The learner of a share of a machine, with these weights and optimisers that have seen nothing.
     ///
     /// # Errors
     /// [`LearningError`], also where the settings ask for what updates on a GPU do not do.
-    pub fn new(machine: Machine, plan: &GpuPlan<'_>, parameters: &Parameters) -> Result<Self, LearningError> {
-        let GpuPlan { model, world, behaviour, .. } = plan;
+    pub fn new(share: &Share, plan: &GpuPlan<'_>, parameters: &Parameters) -> Result<Self, LearningError> {
+        let GpuPlan { model, world, behaviour, stored, .. } = plan;
         let sizes = Sizes {
             model: (*model).clone(),
             batch: plan.batch.0,
             length: plan.batch.1,
             decode_every: world.decode_every,
             mode: plan.mode,
+            looks: plan.looks,
         };
         let scales = WorldScales {
             image: world.image_scale as f32,
@@ -102,12 +109,13 @@ impl GpuLearner {
                 (behaviour_scales(behaviour), adam_scales(&behaviour.actor), adam_scales(&behaviour.critic))
             }),
             average_decay: plan.average_decay,
-            stored_images: plan.stored.0,
-            stored_masks: plan.stored.1,
+            stored_images: stored.iter().map(Placed::end).max().unwrap_or(0),
+            stored_masks: stored.iter().any(|placed| placed.episode.robot_mask.is_some()),
         };
         let specs: Vec<_> = agent::specs(model)?.into_iter().map(|spec| (spec.name, spec.shape)).collect();
         let bins: Vec<f32> = ops::bins(model.bins).collect();
-        let learner = Learner::new(machine, &specs, &bins, settings)?;
+        let bring = |learner: &mut Learner| stored.iter().try_for_each(|placed| store(learner, placed));
+        let learner = share.learner(&specs, &bins, settings, bring)?;
         let kind = model.kind;
         let mut this = Self { learner, kind, world: (*world).clone(), behaviour: behaviour.cloned() };
         this.load(Array::Values, parameters)?;
@@ -122,8 +130,8 @@ impl GpuLearner {
 
     /// Sets the weights or their average.
     pub fn load(&mut self, array: Array, parameters: &Parameters) -> Result<(), LearningError> {
-        for at in 0..self.learner.weights().entries().len() {
-            let name = self.learner.weights().entries()[at].name.clone();
+        for at in 0..self.learner.entries().len() {
+            let name = self.learner.entries()[at].name.clone();
             let Some(var) = parameters.get(&name) else { continue };
             let values = var.flatten_all()?.to_vec1::<f32>()?;
             self.learner.set(array, at, &values)?;
@@ -133,13 +141,13 @@ impl GpuLearner {
 
     /// Goes on with an optimiser's moments.
     pub fn resume(&mut self, adam: &Adam) -> Result<(), LearningError> {
-        for at in 0..self.learner.weights().entries().len() {
-            let Some(moments) = adam.moments().get(&self.learner.weights().entries()[at].name) else {
+        for at in 0..self.learner.entries().len() {
+            let Some(moments) = adam.moments().get(&self.learner.entries()[at].name) else {
                 continue;
             };
             self.learner.set(Array::First, at, &moments.first.flatten_all()?.to_vec1::<f32>()?)?;
             self.learner.set(Array::Second, at, &moments.second.flatten_all()?.to_vec1::<f32>()?)?;
-            self.learner.steps_mut()[at] = moments.steps;
+            self.learner.set_steps(at, moments.steps);
         }
         Ok(())
     }
@@ -151,8 +159,8 @@ impl GpuLearner {
 
     /// Brings the weights, or their average, to `parameters`.
     pub fn write_back(&mut self, array: Array, parameters: &Parameters) -> Result<(), LearningError> {
-        for at in 0..self.learner.weights().entries().len() {
-            let name = self.learner.weights().entries()[at].name.clone();
+        for at in 0..self.learner.entries().len() {
+            let name = self.learner.entries()[at].name.clone();
             let Some(var) = parameters.get(&name) else { continue };
             let values = self.learner.get(array, at)?;
             var.set(&Tensor::from_vec(values, var.shape(), parameters.device())?)?;
@@ -163,9 +171,9 @@ impl GpuLearner {
     /// The optimiser of the world model, the actor or the critic as it is now.
     pub fn adam(&mut self, group: Group, parameters: &Parameters) -> Result<Adam, LearningError> {
         let mut all = BTreeMap::new();
-        for at in 0..self.learner.weights().entries().len() {
-            let entry = self.learner.weights().entries()[at].clone();
-            let steps = self.learner.steps_mut()[at];
+        for at in 0..self.learner.entries().len() {
+            let entry = self.learner.entries()[at].clone();
+            let steps = self.learner.steps(at);
             if entry.group != group || steps == 0 {
                 continue;
             }
@@ -182,13 +190,6 @@ impl GpuLearner {
             _ => &self.world.adam,
         };
         Ok(Adam::resumed(settings.clone(), all))
-    }
-
-    /// Puts an episode's images, and its masks where they are stored, from `place` on.
-    pub fn store(&mut self, place: u32, episode: &Episode) -> Result<(), LearningError> {
-        let images: Vec<u8> = episode.image.iter().copied().collect();
-        let masks: Vec<u8> = episode.robot_mask.iter().flatten().map(|robot| u8::from(*robot)).collect();
-        Ok(self.learner.store(place as usize, &images, &masks)?)
     }
 
     /// One update of the world model from a batch.
@@ -209,11 +210,12 @@ impl GpuLearner {
         noise: Noise,
     ) -> Result<GpuWorldUpdate, LearningError> {
         let (rate, environment) = (self.world.adam.learning_rate, self.world.environment_learning_rate);
-        let values =
-            self.learner.update_world(&on_gpu(batch, images, shift), noise, |name| match side_of(name) {
-                Side::Environment if environment > 0.0 => environment,
-                _ => rate,
-            })?;
+        let colours = colours(batch);
+        let batch = on_gpu(batch, images, &colours, shift);
+        let values = self.learner.update_world(&batch, noise, |name| match side_of(name) {
+            Side::Environment if environment > 0.0 => environment,
+            _ => rate,
+        })?;
         finite("the loss", values.total)?;
         finite("the norm of the gradients", values.gradient_norm)?;
         moved(values.moved)?;
@@ -227,7 +229,7 @@ impl GpuLearner {
         images: Images<'_>,
         noise: Noise,
     ) -> Result<LossValues, LearningError> {
-        let values = self.learner.validate_world(&on_gpu(batch, images, &[]), noise)?;
+        let values = self.learner.validate_world(&on_gpu(batch, images, &colours(batch), &[]), noise)?;
         Ok(self.losses(values))
     }
 
@@ -274,6 +276,21 @@ impl GpuLearner {
     }
 }
 
+/// Puts an episode's images and masks where they belong, and its disturbed pictures where they have a place.
+fn store(learner: &mut Learner, placed: &Placed) -> Result<(), GpuError> {
+    let Placed { episode, images: at, seen } = placed;
+    let images: Vec<u8> = episode.image.iter().copied().collect();
+    let masks: Vec<u8> = episode.robot_mask.iter().flatten().map(|robot| u8::from(*robot)).collect();
+    learner.store(*at as usize, &images, &masks)?;
+    match &episode.disturbed {
+        Some(pictures) if seen != at => {
+            let pictures: Vec<u8> = pictures.iter().copied().collect();
+            learner.store(*seen as usize, &pictures, &[])
+        }
+        _ => Ok(()),
+    }
+}
+
 fn behaviour_scales(settings: &BehaviourSettings) -> rcwm_gpu::behaviour::BehaviourScales {
     rcwm_gpu::behaviour::BehaviourScales {
         length: settings.horizon.length,
@@ -287,9 +304,21 @@ fn behaviour_scales(settings: &BehaviourSettings) -> rcwm_gpu::behaviour::Behavi
     }
 }
 
-fn on_gpu<'a>(batch: &'a HostBatch, images: Images<'a>, shift: &'a [[i32; 2]]) -> rcwm_gpu::Batch<'a> {
+/// How the colours of each sequence change.
+fn colours(batch: &HostBatch) -> Vec<Option<Colours>> {
+    let of = |jitter: Jitter| Colours { gain: jitter.gain, offset: jitter.offset, grey: jitter.grey };
+    batch.seen_jitter.iter().map(|jitter| jitter.map(of)).collect()
+}
+
+fn on_gpu<'a>(
+    batch: &'a HostBatch,
+    images: Images<'a>,
+    colours: &'a [Option<Colours>],
+    shift: &'a [[i32; 2]],
+) -> rcwm_gpu::Batch<'a> {
     rcwm_gpu::Batch {
         images,
+        seen: Seen { host: &batch.seen, stored: &batch.seen_place, colours },
         action: &batch.action,
         reward: &batch.reward,
         terminal: &batch.terminal,

@@ -3,6 +3,7 @@ use std::ops::Range;
 use candle_core::{Device, Result, Tensor};
 use rcwm_models::{ACTION_LEN, IMAGE_CHANNELS, IMAGE_SIDE};
 
+use super::Jitter;
 use crate::model::latent::FirstSteps;
 
 /// Sequences of experience as tensors.
@@ -62,6 +63,9 @@ pub struct HostBatch {
     pub seen: Vec<u8>,
     /// B * T places of images in a store; empty where the images are here.
     pub place: Vec<u32>,
+    /// B * T places of the images that the encoders see there, and by row how these change; empty where `seen` holds them.
+    pub seen_place: Vec<u32>,
+    pub seen_jitter: Vec<Option<Jitter>>,
     /// Whether masks are used.
     pub masks: bool,
     /// B * T actions.

@@ -13,12 +13,12 @@ mod updates;
 use std::path::Path;
 
 use candle_core::Device;
-use rcwm_gpu::Machine;
 
 pub use group::{Group, Measure};
 pub use reference::{Reference, ReferenceError};
 pub use report::{Comparison, GroupReport, Report, Unchecked};
 
+use crate::gpu::Share;
 use crate::learning::LearningError;
 use crate::model::parameters::ParameterError;
 
@@ -60,11 +60,11 @@ pub fn check_file(
 pub fn check_programs(
     path: &Path,
     groups: &[Group],
-    machine: Machine,
+    share: &Share,
     done: &mut dyn FnMut(&GroupReport),
 ) -> Result<Report, ParityError> {
     let reference = Reference::read(path)?;
-    let made = programs::Programs::new(&reference, machine)?;
+    let made = programs::Programs::new(&reference, share)?;
     let mut reports = Vec::new();
     for group in groups.iter().filter(|group| **group > Group::Behaviour) {
         let report = compare(&reference, *group, made.compute(*group)?)?;

@@ -1,5 +1,4 @@
 use candle_core::{DType, Device, Tensor};
-use rcwm_gpu::Machine;
 use rcwm_gpu::weights::{Array, Group as Trained};
 use rcwm_models::ACTION_LEN;
 
@@ -7,7 +6,7 @@ use super::forward::{Named, behaviour_settings, parameters};
 use super::updates::unresolved;
 use super::{Group, ParityError, Reference};
 use crate::behaviour::BehaviourUpdate;
-use crate::gpu::{GpuLearner, GpuPlan, GpuWorldUpdate, numbered_noise};
+use crate::gpu::{GpuLearner, GpuPlan, GpuWorldUpdate, Share, numbered_noise};
 use crate::learning::{HostBatch, WorldSettings};
 
 /// One update of the world model and one of actor and critic, from the file's weights and inputs, by programs on a machine.
@@ -21,7 +20,7 @@ pub(super) struct Programs {
 }
 
 impl Programs {
-    pub fn new(reference: &Reference, machine: Machine) -> Result<Self, ParityError> {
+    pub fn new(reference: &Reference, share: &Share) -> Result<Self, ParityError> {
         let settings = WorldSettings { reward_scale: reference.reward_scale, ..WorldSettings::default() };
         let behaviour = behaviour_settings(reference);
         let plan = GpuPlan {
@@ -30,11 +29,12 @@ impl Programs {
             world: &settings,
             behaviour: Some(&behaviour),
             average_decay: 0.0,
-            stored: (0, false),
+            stored: &[],
+            looks: false,
             mode: true,
         };
         let weights = parameters(reference, &Device::Cpu)?;
-        let mut learner = GpuLearner::new(machine, &plan, &weights)?;
+        let mut learner = GpuLearner::new(share, &plan, &weights)?;
         let world = learner.update_world(&host_batch(reference)?, numbered_noise(0, 0))?;
         let shape = (reference.length, reference.batch);
         let mut kl = |branch| -> Result<Tensor, ParityError> {
@@ -117,8 +117,8 @@ fn tensors(
 ) -> Result<Vec<(String, Trained, Tensor)>, ParityError> {
     let learner = learner.learner_mut();
     let mut found = Vec::new();
-    for at in 0..learner.weights().entries().len() {
-        let entry = learner.weights().entries()[at].clone();
+    for at in 0..learner.entries().len() {
+        let entry = learner.entries()[at].clone();
         if wanted(&entry.group) {
             let values = learner.get(array, at).map_err(crate::learning::LearningError::from)?;
             let tensor = Tensor::from_vec(values, entry.shape.as_slice(), &Device::Cpu)?;

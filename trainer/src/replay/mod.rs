@@ -24,4 +24,4 @@ pub use load::Folder;
 pub use prefetch::{Prefetch, PrefetchError};
 pub use shared::SharedReplay;
 pub(crate) use store::check_episode;
-pub use store::{Replay, ReplayError, Starts, append_steps};
+pub use store::{Placed, Replay, ReplayError, Starts, append_steps};

@@ -60,8 +60,8 @@ pub enum Starts {
 pub(super) struct Stored {
     pub(super) episode: Arc<Episode>,
     number: u64,
-    /// Where its images begin in a store.
-    place: Option<u32>,
+    /// Where its images begin in a store, and those that it is seen by when it is disturbed.
+    place: Option<(u32, u32)>,
 }
 
 /// One task's episodes, oldest first.
@@ -69,6 +69,24 @@ pub(super) struct Stored {
 pub(super) struct Task {
     pub(super) episodes: VecDeque<Stored>,
     pub(super) steps: usize,
+}
+
+/// Where an episode is in a store of images.
+#[derive(Debug, Clone)]
+pub struct Placed {
+    pub episode: Arc<Episode>,
+    /// The place of its first image.
+    pub images: u32,
+    /// The place of its first disturbed picture; that of the images where these are not stored.
+    pub seen: u32,
+}
+
+impl Placed {
+    /// The place behind it.
+    #[must_use]
+    pub fn end(&self) -> usize {
+        self.images.max(self.seen) as usize + self.episode.len()
+    }
 }
 
 /// Episodes by task, up to a number of steps; the oldest go first.
@@ -148,14 +166,19 @@ impl Replay {
         self.tasks.retain(|_, task| !task.episodes.is_empty());
     }
 
-    /// Gives the images of every episode a place in a store, from `from` on; the first place that is free. Batches name places from then
-    /// on, in place of images and masks.
-    pub fn place_images(&mut self, from: u32, mut put: impl FnMut(u32, &Arc<Episode>)) -> u32 {
+    /// Gives the images of every episode a place in a store, from `from` on, and where `disturbed` its disturbed pictures the places
+    /// behind them; the first place that is free. Batches name places from then on, in place of images and masks.
+    pub fn place_images(&mut self, from: u32, disturbed: bool, mut put: impl FnMut(Placed)) -> u32 {
         let mut next = from;
         for stored in self.tasks.values_mut().flat_map(|task| &mut task.episodes) {
-            put(next, &stored.episode);
-            stored.place = Some(next);
-            next += stored.episode.len() as u32;
+            let (images, steps) = (next, stored.episode.len() as u32);
+            next += steps;
+            let mut seen = images;
+            if disturbed && stored.episode.disturbed.is_some() {
+                (seen, next) = (next, next + steps);
+            }
+            stored.place = Some((images, seen));
+            put(Placed { episode: stored.episode.clone(), images, seen });
         }
         next
     }
@@ -256,10 +279,13 @@ impl Task {
             let Stored { episode, place, .. } = &self.episodes[index];
             let count = left.min(episode.len() - step);
             match place {
-                Some(place) => append_places(name, episode, *place, step, count, batch)?,
+                Some((place, _)) => append_places(name, episode, *place, step, count, batch)?,
                 None => append_steps(name, episode, step, count, masks, batch)?,
             }
-            if let Some(look) = look {
+            if let (Some(look), Some((place, disturbed))) = (look, *place) {
+                let from = if look.disturbed { disturbed } else { place } + step as u32;
+                batch.seen_place.extend(from..from + count as u32);
+            } else if let Some(look) = look {
                 let disturbed = episode.disturbed.as_ref().filter(|_| look.disturbed);
                 let range = ndarray::Slice::from(step..step + count);
                 batch.seen.extend(disturbed.unwrap_or(&episode.image).slice_axis(Axis(0), range));
@@ -268,8 +294,12 @@ impl Task {
             step = 0;
             index = (index + 1) % self.episodes.len();
         }
-        if let Some(jitter) = look.and_then(|look| look.jitter) {
+        let jitter = look.and_then(|look| look.jitter);
+        if let Some(jitter) = jitter {
             jitter.apply(&mut batch.seen[from..]);
+        }
+        if !batch.seen_place.is_empty() {
+            batch.seen_jitter.push(jitter);
         }
         Ok(())
     }

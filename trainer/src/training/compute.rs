@@ -1,16 +1,13 @@
 //! Where a run's updates are computed, and who makes them.
 
-use std::sync::Arc;
-
 use candle_core::Device;
 use rcwm_gpu::Machine;
 use rcwm_gpu::learner::Images;
 use rcwm_gpu::weights::{Array, Group};
-use rcwm_models::episode::Episode;
 
 use super::{Run, TrainingError, TrainingSettings};
 use crate::behaviour::{BehaviourLearner, BehaviourUpdate, ReturnRange};
-use crate::gpu::{GpuLearner, GpuPlan, numbered_noise};
+use crate::gpu::{GpuLearner, GpuPlan, Share, numbered_noise};
 use crate::learning::{Adam, HostBatch, LossValues, Trained, WorldLearner};
 use crate::model::latent::Sampler;
 use crate::model::parameters::Parameters;
@@ -22,7 +19,15 @@ pub enum Compute {
     /// By candle's tensors and the fused ops.
     Tensors(Device),
     /// By programs of kernels. Everything that is no update, films for example, stays on the CPU.
-    Programs(Machine),
+    Programs(Share),
+}
+
+impl Compute {
+    /// The machine's programs, for all runs that it was made for.
+    #[must_use]
+    pub fn programs(machine: Machine) -> Vec<Self> {
+        Share::all(machine).into_iter().map(Self::Programs).collect()
+    }
 }
 
 impl From<&Device> for Compute {
@@ -58,7 +63,7 @@ pub(super) enum WorldUpdates {
     },
     /// The programs are laid out when the replay is known.
     Waiting {
-        machine: Option<Machine>,
+        share: Share,
         adam: Adam,
     },
     Programs {
@@ -83,10 +88,9 @@ impl WorldUpdates {
                 }
                 Self::Tensors { learner: Box::new(learner), device }
             }
-            Compute::Programs(_) if !settings.replay.look.is_plain() => return Err(TrainingError::LookOnGpu),
-            Compute::Programs(machine) => {
+            Compute::Programs(share) => {
                 let adam = adam.unwrap_or_else(|| Adam::new(settings.world.adam.clone()));
-                Self::Waiting { machine: Some(machine), adam }
+                Self::Waiting { share, adam }
             }
         })
     }
@@ -99,32 +103,26 @@ impl WorldUpdates {
         run: &Run,
         replays: [&mut Replay; 2],
     ) -> Result<(), TrainingError> {
-        let (machine, adam) = match self {
-            Self::Waiting { machine, adam } => (machine.take(), adam.clone()),
-            Self::Tensors { .. } | Self::Programs { .. } => return Ok(()),
-        };
-        let Some(machine) = machine else { return Err(TrainingError::NoMachine) };
+        let Self::Waiting { share, adam } = self else { return Ok(()) };
+        let disturbed = settings.replay.look.disturbed > 0.0;
         let mut steps = 0;
-        let mut episodes: Vec<(u32, Arc<Episode>)> = Vec::new();
+        let mut episodes = Vec::new();
         for replay in replays {
-            steps = replay.place_images(steps, |place, episode| episodes.push((place, episode.clone())));
+            steps = replay.place_images(steps, disturbed, |placed| episodes.push(placed));
         }
-        let masks = episodes.iter().any(|(_, episode)| episode.robot_mask.is_some());
         let plan = GpuPlan {
             model: &settings.model,
             batch: (settings.replay.batch, settings.replay.length),
             world: &settings.world,
             behaviour: None,
             average_decay: settings.average_decay,
-            stored: (steps.max(1) as usize, masks),
+            stored: &episodes,
+            looks: !settings.replay.look.is_plain(),
             mode: false,
         };
-        let mut learner = GpuLearner::new(machine, &plan, parameters)?;
+        let mut learner = GpuLearner::new(share, &plan, parameters)?;
         learner.load(Array::Average, &run.ema_weights(parameters))?;
-        learner.resume(&adam)?;
-        for (place, episode) in episodes {
-            learner.store(place, &episode)?;
-        }
+        learner.resume(adam)?;
         *self = Self::Programs { learner: Box::new(learner) };
         Ok(())
     }
@@ -200,18 +198,18 @@ impl AgentUpdates {
                 behaviour: Box::new(BehaviourLearner::new(parameters, model, behaviour)?),
                 device,
             },
-            Compute::Programs(_) if !settings.replay.look.is_plain() => return Err(TrainingError::LookOnGpu),
-            Compute::Programs(machine) => {
+            Compute::Programs(share) => {
                 let plan = GpuPlan {
                     model,
                     batch: (settings.replay.batch, settings.replay.length),
                     world,
                     behaviour: Some(behaviour),
                     average_decay: 0.0,
-                    stored: (0, false),
+                    stored: &[],
+                    looks: !settings.replay.look.is_plain(),
                     mode: false,
                 };
-                let learner = Box::new(GpuLearner::new(machine, &plan, parameters)?);
+                let learner = Box::new(GpuLearner::new(&share, &plan, parameters)?);
                 Self::Programs { learner, range: ReturnRange::default() }
             }
         })

@@ -93,17 +93,9 @@ use std::path::PathBuf;
 /// Why a run ended early.
 #[derive(Debug, thiserror::Error)]
 pub enum TrainingError {
-    /// An earlier try could not set up the GPU and gave it back.
-    #[error("the GPU was given back when setting up failed; start the run again")]
-    NoMachine,
     /// The episodes that a run is judged by could not be run.
     #[error("evaluation: {0}")]
     Evaluation(#[source] Box<crate::evaluation::ClosedLoopError>),
-    /// What programs do not do yet.
-    #[error(
-        "replay.look: updates on a GPU see pictures as they are; set replay.look.disturbed and replay.look.jitter to 0, or leave out --device"
-    )]
-    LookOnGpu,
     /// The folder holds a run.
     #[error("{path} holds a run already; say --resume, or choose another folder")]
     Exists { path: PathBuf },

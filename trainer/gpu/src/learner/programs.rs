@@ -29,6 +29,8 @@ pub(super) struct Room {
     pub(super) behaviour_scalars: Matrix,
     pub(super) range: Matrix,
     pub(super) keep: u64,
+    /// Whether a run is changed by the next program (u32).
+    pub(super) taking_part: u64,
 }
 
 /// The programs of a learner.
@@ -93,12 +95,21 @@ impl Room {
         let stored = settings.stored_images > 0;
         let images = if stored { settings.stored_images } else { rows };
         let masks = if !stored || settings.stored_masks { images } else { 1 };
-        let (images, masks) = (machine.allocate(images * 12288)?, machine.allocate(masks * 4096)?);
+        // What the encoders see lies behind a batch's own images.
+        let images = if sizes.looks && !stored { 2 * images } else { images };
+        let sizes_of = [images * 12288, masks * 4096];
+        let [images, masks] = if stored {
+            [machine.allocate_shared(sizes_of[0])?, machine.allocate_shared(sizes_of[1])?]
+        } else {
+            [machine.allocate(sizes_of[0])?, machine.allocate(sizes_of[1])?]
+        };
         let mut words = |count: usize| machine.allocate(4 * count);
         let inputs = Inputs {
             images,
             masks,
             index: words(rows)?,
+            seen: words(rows)?,
+            colours: words(8 * sizes.batch)?,
             shift: words(2 * sizes.batch)?,
             action: words(rows * sizes.model.action)?,
             reward: words(rows)?,
@@ -117,6 +128,7 @@ impl Room {
             behaviour_scalars: Matrix::fixed(words(behaviour::SCALARS)?, 1, behaviour::SCALARS),
             range: Matrix::fixed(words(2)?, 1, 2),
             keep: words(1)?,
+            taking_part: words(1)?,
         })
     }
 }
@@ -145,7 +157,7 @@ impl Programs {
             if learns {
                 world::losses(&mut tape, source, &settings.sizes, room.inputs, parts, out);
                 let average = (settings.average_decay > 0.0).then_some(room.keep);
-                step(&mut tape, weights, &optimisers[..1], room.scalars, average);
+                step(&mut tape, weights, &optimisers[..1], (room.scalars, room.taking_part), average);
             } else {
                 let sizes = &settings.sizes;
                 tape.without_gradient(|tape| world::losses(tape, source, sizes, room.inputs, parts, out));
@@ -160,7 +172,8 @@ impl Programs {
             }
             let values = |group| weights.group(Array::Values, group);
             let (critic, slow) = (values(Group::Critic), values(Group::SlowCritic));
-            let p = [critic, slow].map(Pointer::from);
+            let taking_part = Matrix::fixed(room.taking_part, 1, 1);
+            let p = [critic, slow, taking_part].map(Pointer::from);
             tape.program.kernel(
                 Kernel::Mix,
                 Grid::elements(critic.len()),
@@ -172,9 +185,9 @@ impl Programs {
             let sources =
                 Sources { frozen: source(|_| false), actor: source(is_actor), critic: source(is_critic) };
             let noise = (room.inputs.noise, settings.sizes.words());
-            let out = (room.range, room.behaviour_scalars);
+            let out = (room.range, room.behaviour_scalars, taking_part);
             behaviour::losses(&mut tape, sources, &settings.sizes, &scales, room.features, noise, out);
-            step(&mut tape, weights, &optimisers[1..], room.behaviour_scalars, None);
+            step(&mut tape, weights, &optimisers[1..], (room.behaviour_scalars, room.taking_part), None);
             tape.program
         });
         let programs: Vec<Program> = [world(false, true), world(true, true), world(false, false)]
@@ -195,7 +208,13 @@ impl Programs {
 }
 
 /// Adds the clipping by their norms and one step of Adam for optimisers whose clips lie one after the other: all move, or none does.
-fn step(tape: &mut Tape, weights: &Weights, optimisers: &[Optimiser], scalars: Matrix, keep: Option<u64>) {
+fn step(
+    tape: &mut Tape,
+    weights: &Weights,
+    optimisers: &[Optimiser],
+    (scalars, taking_part): (Matrix, u64),
+    keep: Option<u64>,
+) {
     const RUN: usize = 16_384;
     tape.program.part("optimiser");
     let clip = |optimiser: &Optimiser| Matrix::fixed(optimiser.clip, 1, 2);
@@ -205,7 +224,7 @@ fn step(tape: &mut Tape, weights: &Weights, optimisers: &[Optimiser], scalars: M
         let partial = tape.matrix(1, blocks);
         let grid = Grid { blocks, threads: 512, shared_bytes: 0 };
         tape.program.kernel(Kernel::Squares, grid, &[gradient.into(), partial.into()], &[count, RUN], &[]);
-        let p = [partial, scalars, clip(optimiser)].map(Pointer::from);
+        let p = [partial, scalars, clip(optimiser), Matrix::fixed(taking_part, 1, 1)].map(Pointer::from);
         let grid = Grid { blocks: 1, threads: 512, shared_bytes: 0 };
         let most = optimiser.scales.clip_norm;
         tape.program.kernel(Kernel::Clip, grid, &p, &[blocks, scalars.len()], &[most]);

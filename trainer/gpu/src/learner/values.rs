@@ -17,7 +17,7 @@ pub struct AdamScales {
 }
 
 /// What a learner does.
-#[derive(Debug, Clone)]
+#[derive(Debug, Clone, PartialEq)]
 pub struct LearnerSettings {
     /// Sizes of batch and model.
     pub sizes: Sizes,
@@ -39,6 +39,8 @@ pub struct LearnerSettings {
 #[derive(Debug, Clone, Copy)]
 pub struct Batch<'a> {
     pub images: Images<'a>,
+    /// What the encoders see in their place; empty: the same. Only learners that are made for looks take others.
+    pub seen: Seen<'a>,
     /// [B, T, action].
     pub action: &'a [f32],
     /// [B, T].
@@ -62,6 +64,25 @@ pub enum Images<'a> {
     Host(&'a [u8], &'a [u8]),
     /// On the machine, by number: [B, T].
     Stored(&'a [u32]),
+}
+
+/// What the encoders see.
+#[derive(Debug, Clone, Copy, Default)]
+pub struct Seen<'a> {
+    /// u8 [B, T, 64, 64, 3], where the batch brings its images.
+    pub host: &'a [u8],
+    /// Numbers of images on the machine, where it does not: [B, T].
+    pub stored: &'a [u32],
+    /// How each sequence's colours change [B], where the pictures are stored.
+    pub colours: &'a [Option<Colours>],
+}
+
+/// A change of colours: `gain * (colour + grey * (mean - colour)) + offset`, of 255.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct Colours {
+    pub gain: [f32; 3],
+    pub offset: [f32; 3],
+    pub grey: f32,
 }
 
 /// The generator that noise is drawn from: ChaCha8's key, and its stream.

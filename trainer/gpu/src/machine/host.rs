@@ -3,7 +3,7 @@
 use std::sync::{Mutex, PoisonError};
 use std::time::Instant;
 
-use super::{Args, Kernel, PartTime, begin};
+use super::{Args, Kernel, PartTime, Runs, begin};
 use crate::commands::{Command, Finished, Lane, Product};
 
 pub(super) type Function = unsafe extern "C" fn(Args, i32, i32);
@@ -60,7 +60,7 @@ impl Host {
         unsafe { std::ptr::copy_nonoverlapping(address as *const u8, bytes.as_mut_ptr(), bytes.len()) }
     }
 
-    pub(super) fn run(&mut self, program: &Finished) {
+    pub(super) fn run(&mut self, program: &Finished, runs: Runs<'_>) {
         let mut waiting = Vec::new();
         for item in &program.items {
             let side = item.lane == Lane::Side;
@@ -69,22 +69,22 @@ impl Host {
                 continue;
             }
             if side {
-                waiting.drain(..).for_each(execute);
+                waiting.drain(..).for_each(|command| execute(command, runs));
             }
-            execute(&item.command);
+            execute(&item.command, runs);
         }
     }
 
-    pub(super) fn time_parts(&mut self, program: &Finished) -> Vec<PartTime> {
+    pub(super) fn time_parts(&mut self, program: &Finished, runs: Runs<'_>) -> Vec<PartTime> {
         let mut times: Vec<PartTime> =
             program.parts.iter().map(|part| PartTime { part, commands: 0, ms: 0.0, flops: 0.0 }).collect();
         for item in &program.items {
             let start = Instant::now();
-            execute(&item.command);
+            execute(&item.command, runs);
             let time = &mut times[usize::from(item.part)];
             time.ms += 1e3 * start.elapsed().as_secs_f64();
             time.commands += 1;
-            time.flops += flops(&item.command);
+            time.flops += runs.count as f64 * flops(&item.command);
         }
         times
     }
@@ -101,12 +101,15 @@ pub(super) fn flops(command: &Command) -> f64 {
     }
 }
 
-fn execute(command: &Command) {
+fn execute(command: &Command, runs: Runs<'_>) {
     match command {
         // Loops over numbers and rows take any number of blocks; where the blocks are what is counted, all of them run.
-        Command::Kernel { kernel, grid, p, n, f } => call(*kernel, Args::new(p, n, f), grid.blocks),
+        Command::Kernel { kernel, grid, p, n, f } => {
+            let args = Args::new(p, n, f, runs);
+            (0..runs.count).for_each(|run| call(*kernel, args.of_run(run), grid.blocks));
+        }
         Command::HandOver => (),
-        Command::Product(product) => multiply(product),
+        Command::Product(product) => (0..runs.count).for_each(|run| multiply(product, run, runs)),
     }
 }
 
@@ -122,8 +125,9 @@ fn call(kernel: Kernel, args: Args, blocks: usize) {
     }
 }
 
-fn multiply(p: &Product) {
+fn multiply(p: &Product, run: usize, runs: Runs<'_>) {
     let (m, n, k) = p.sizes();
+    let begin = |matrix| begin(matrix) + (run * runs.apart(begin(matrix))) as u64;
     let strides = |stride: usize, transposed: bool| {
         let (row, column) = if transposed { (1, stride) } else { (stride, 1) };
         (row as isize, column as isize)

@@ -4,13 +4,15 @@ mod host;
 #[cfg(feature = "cuda")]
 mod nvidia;
 
+use std::collections::BTreeMap;
+
 use crate::commands::{Buffer, Command, Finished, Matrix, Pointer};
 pub use crate::kernel::Kernel;
 use crate::kernel::each_kernel;
 
-pub use host::Host;
+use host::Host;
 #[cfg(feature = "cuda")]
-pub use nvidia::Nvidia;
+use nvidia::Nvidia;
 
 /// Why something did not run on a machine.
 #[derive(Debug, thiserror::Error)]
@@ -56,9 +58,17 @@ pub enum Precision {
     Tf32,
 }
 
-/// The host, or a GPU.
+/// The host or a GPU, and the memory of the runs that learn there together: one program updates all of them at once.
 #[derive(Debug)]
-pub enum Machine {
+pub struct Machine {
+    place: Place,
+    runs: usize,
+    /// Bytes from one run's memory to the next one's, by address; 0: the same for all.
+    apart: BTreeMap<u64, usize>,
+}
+
+#[derive(Debug)]
+enum Place {
     /// The kernels compiled as C.
     Host(Host),
     /// An NVIDIA GPU.
@@ -99,15 +109,19 @@ pub struct CommandTime {
 }
 
 impl Machine {
+    fn of(place: Place) -> Self {
+        Self { place, runs: 1, apart: BTreeMap::new() }
+    }
+
     #[must_use]
     pub fn host() -> Self {
-        Self::Host(Host::default())
+        Self::of(Place::Host(Host::default()))
     }
 
     /// The host, which runs what may run in any order in another one than [`Machine::host`].
     #[must_use]
     pub fn host_with_side_late() -> Self {
-        Self::Host(Host::with_side_late())
+        Self::of(Place::Host(Host::with_side_late()))
     }
 
     /// The GPU of this number.
@@ -116,7 +130,7 @@ impl Machine {
     /// [`GpuError::Unavailable`], [`GpuError::NotBuilt`] or [`GpuError::Failed`].
     pub fn nvidia(ordinal: usize, precision: Precision) -> Result<Self, GpuError> {
         #[cfg(feature = "cuda")]
-        return Ok(Self::Nvidia(Box::new(Nvidia::new(ordinal, precision)?)));
+        return Ok(Self::of(Place::Nvidia(Box::new(Nvidia::new(ordinal, precision)?))));
         #[cfg(not(feature = "cuda"))]
         {
             let _ = (ordinal, precision);
@@ -124,67 +138,113 @@ impl Machine {
         }
     }
 
+    /// The same machine for so many runs that learn together. A single run's memory is the first one's.
+    #[must_use]
+    pub fn for_runs(self, runs: usize) -> Self {
+        assert!(self.apart.is_empty() && runs > 0, "runs are counted before memory is taken");
+        Self { runs, ..self }
+    }
+
+    /// Runs that learn together.
+    #[must_use]
+    pub fn runs(&self) -> usize {
+        self.runs
+    }
+
     /// What it is, in words.
     #[must_use]
     pub fn name(&self) -> String {
-        match self {
-            Self::Host(_) => "host".to_owned(),
+        match &self.place {
+            Place::Host(_) => "host".to_owned(),
             #[cfg(feature = "cuda")]
-            Self::Nvidia(gpu) => gpu.name(),
+            Place::Nvidia(gpu) => gpu.name(),
         }
     }
 
-    /// Memory of this many bytes, all zero, until the machine is dropped.
+    /// Memory of this many bytes for each run, all zero, until the machine is dropped; the first run's address.
     ///
     /// # Errors
     /// [`GpuError::Memory`].
     pub fn allocate(&mut self, bytes: usize) -> Result<u64, GpuError> {
-        match self {
-            Self::Host(host) => Ok(host.allocate(bytes)),
+        let apart = bytes.next_multiple_of(APART_UNIT);
+        let address = self.take(apart * self.runs)?;
+        self.apart.insert(address, if self.runs > 1 { apart } else { 0 });
+        Ok(address)
+    }
+
+    /// The same, for all runs together.
+    ///
+    /// # Errors
+    /// [`GpuError::Memory`].
+    pub fn allocate_shared(&mut self, bytes: usize) -> Result<u64, GpuError> {
+        let address = self.take(bytes)?;
+        self.apart.insert(address, 0);
+        Ok(address)
+    }
+
+    fn take(&mut self, bytes: usize) -> Result<u64, GpuError> {
+        match &mut self.place {
+            Place::Host(host) => Ok(host.allocate(bytes)),
             #[cfg(feature = "cuda")]
-            Self::Nvidia(gpu) => gpu.allocate(bytes),
+            Place::Nvidia(gpu) => gpu.allocate(bytes),
         }
     }
 
     /// Bytes allocated.
     #[must_use]
     pub fn allocated(&self) -> usize {
-        match self {
-            Self::Host(host) => host.allocated(),
+        match &self.place {
+            Place::Host(host) => host.allocated(),
             #[cfg(feature = "cuda")]
-            Self::Nvidia(gpu) => gpu.allocated(),
+            Place::Nvidia(gpu) => gpu.allocated(),
         }
     }
 
-    /// Copies numbers to an address that [`Machine::allocate`] gave, after everything that was run before.
-    pub fn upload<T: bytemuck::Pod>(&mut self, address: u64, values: &[T]) -> Result<(), GpuError> {
-        let bytes = bytemuck::cast_slice(values);
-        match self {
-            Self::Host(host) => host.upload(address, bytes),
+    /// Copies numbers to an address that [`Machine::allocate`] gave, in the memory of a run, after everything that was run before.
+    pub fn upload<T: bytemuck::Pod>(
+        &mut self,
+        address: u64,
+        run: usize,
+        values: &[T],
+    ) -> Result<(), GpuError> {
+        let (address, bytes) = (self.of_run(address, run), bytemuck::cast_slice(values));
+        match &mut self.place {
+            Place::Host(host) => host.upload(address, bytes),
             #[cfg(feature = "cuda")]
-            Self::Nvidia(gpu) => gpu.upload(address, bytes)?,
+            Place::Nvidia(gpu) => gpu.upload(address, bytes)?,
         }
         Ok(())
     }
 
-    /// Copies numbers from an address, after everything that was run before.
-    pub fn download<T: bytemuck::Pod>(&mut self, address: u64, values: &mut [T]) -> Result<(), GpuError> {
-        let bytes = bytemuck::cast_slice_mut(values);
-        match self {
-            Self::Host(host) => host.download(address, bytes),
+    /// Copies numbers from an address in the memory of a run, after everything that was run before.
+    pub fn download<T: bytemuck::Pod>(
+        &mut self,
+        address: u64,
+        run: usize,
+        values: &mut [T],
+    ) -> Result<(), GpuError> {
+        let (address, bytes) = (self.of_run(address, run), bytemuck::cast_slice_mut(values));
+        match &mut self.place {
+            Place::Host(host) => host.download(address, bytes),
             #[cfg(feature = "cuda")]
-            Self::Nvidia(gpu) => gpu.download(address, bytes)?,
+            Place::Nvidia(gpu) => gpu.download(address, bytes)?,
         }
         Ok(())
+    }
+
+    fn of_run(&self, address: u64, run: usize) -> u64 {
+        assert!(run < self.runs, "run {run} of {}", self.runs);
+        address + (run * apart_at(&self.apart, address)) as u64
     }
 
     /// Makes a program ready; on a GPU it is captured, so that its first run costs what every run does.
     pub fn prepare(&mut self, finished: Finished) -> Result<Ready, GpuError> {
+        let runs = Runs { count: self.runs, apart: &self.apart };
         Ok(Ready {
             #[cfg(feature = "cuda")]
-            graph: match self {
-                Self::Host(_) => None,
-                Self::Nvidia(gpu) => gpu.capture(&finished)?,
+            graph: match &mut self.place {
+                Place::Host(_) => None,
+                Place::Nvidia(gpu) => gpu.capture(&finished, runs)?,
             },
             finished,
         })
@@ -192,33 +252,56 @@ impl Machine {
 
     /// Runs a program; on a GPU it may be under way when this returns.
     pub fn run(&mut self, program: &Ready) -> Result<(), GpuError> {
-        match self {
-            Self::Host(host) => host.run(&program.finished),
+        let runs = Runs { count: self.runs, apart: &self.apart };
+        match &mut self.place {
+            Place::Host(host) => host.run(&program.finished, runs),
             #[cfg(feature = "cuda")]
-            Self::Nvidia(gpu) => gpu.run(program.graph.as_ref())?,
+            Place::Nvidia(gpu) => gpu.run(program.graph.as_ref())?,
         }
         Ok(())
     }
 
     /// Runs a program command by command and says how long each part took.
     pub fn time_parts(&mut self, program: &Ready) -> Result<Vec<PartTime>, GpuError> {
-        match self {
-            Self::Host(host) => Ok(host.time_parts(&program.finished)),
+        let runs = Runs { count: self.runs, apart: &self.apart };
+        match &mut self.place {
+            Place::Host(host) => Ok(host.time_parts(&program.finished, runs)),
             #[cfg(feature = "cuda")]
-            Self::Nvidia(gpu) => gpu.time_parts(&program.finished),
+            Place::Nvidia(gpu) => gpu.time_parts(&program.finished, runs),
+        }
+    }
+
+    /// How long each kind of command of a program takes by itself, the dearest first; nothing on the host.
+    pub fn time_commands(&mut self, program: &Ready) -> Result<Vec<CommandTime>, GpuError> {
+        let runs = Runs { count: self.runs, apart: &self.apart };
+        match &mut self.place {
+            Place::Host(_) => Ok(Vec::new()),
+            #[cfg(feature = "cuda")]
+            Place::Nvidia(gpu) => gpu.time_commands(&program.finished, runs),
         }
     }
 }
 
-impl Machine {
-    /// How long each kind of command of a program takes by itself, the dearest first; nothing on the host.
-    pub fn time_commands(&mut self, program: &Ready) -> Result<Vec<CommandTime>, GpuError> {
-        match self {
-            Self::Host(_) => Ok(Vec::new()),
-            #[cfg(feature = "cuda")]
-            Self::Nvidia(gpu) => gpu.time_commands(&program.finished),
-        }
+/// What kernels count the distance of two runs' memory in.
+const APART_UNIT: usize = 256;
+
+/// Where the runs that learn together have their memory.
+#[derive(Debug, Clone, Copy)]
+struct Runs<'a> {
+    count: usize,
+    apart: &'a BTreeMap<u64, usize>,
+}
+
+impl Runs<'_> {
+    /// Bytes from a number of the first run to that of the next.
+    fn apart(self, address: u64) -> usize {
+        apart_at(self.apart, address)
     }
+}
+
+/// The distance of runs in the memory that an address lies in.
+fn apart_at(apart: &BTreeMap<u64, usize>, address: u64) -> usize {
+    apart.range(..=address).next_back().map_or(0, |(_, apart)| *apart)
 }
 
 impl Ready {
@@ -248,19 +331,30 @@ each_kernel!(host_kernels);
 #[derive(Debug, Clone, Copy, Default)]
 pub(in crate::machine) struct Args {
     p: [u64; 16],
+    apart: [u32; 16],
     n: [i32; 16],
     f: [f32; 8],
 }
 
 impl Args {
-    fn new(p: &[Pointer], n: &[i32], f: &[f32]) -> Self {
+    fn new(p: &[Pointer], n: &[i32], f: &[f32], runs: Runs<'_>) -> Self {
         let mut args = Self::default();
-        for (to, from) in args.p.iter_mut().zip(p) {
-            *to = from.place.map_or(0, |place| address(place) + from.bytes as u64);
+        for ((to, apart), from) in args.p.iter_mut().zip(&mut args.apart).zip(p) {
+            let Some(place) = from.place else { continue };
+            *to = address(place) + from.bytes as u64;
+            *apart = (runs.apart(*to) / APART_UNIT) as u32;
         }
         args.n[..n.len()].copy_from_slice(n);
         args.f[..f.len()].copy_from_slice(f);
         args
+    }
+
+    /// The arguments with the addresses of another run than the first.
+    fn of_run(mut self, run: usize) -> Self {
+        for (address, apart) in self.p.iter_mut().zip(self.apart) {
+            *address += (APART_UNIT * run) as u64 * u64::from(apart);
+        }
+        self
     }
 }
 

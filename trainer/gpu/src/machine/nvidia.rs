@@ -13,7 +13,7 @@ use cudarc::driver::{
 use cudarc::nvrtc::{CompileOptions, Ptx, compile_ptx_with_opts};
 
 use super::host::flops;
-use super::{Args, CommandTime, GpuError, Kernel, PartTime, Precision, begin};
+use super::{Args, CommandTime, GpuError, Kernel, PartTime, Precision, Runs, begin};
 use crate::commands::{Command, Finished, Lane, Product};
 
 // SAFETY: plain numbers in C's layout, the same on host and device.
@@ -209,20 +209,24 @@ impl Nvidia {
     }
 
     /// A program as a graph.
-    pub(super) fn capture(&mut self, program: &Finished) -> Result<Option<Graph>, GpuError> {
+    pub(super) fn capture(&mut self, program: &Finished, runs: Runs<'_>) -> Result<Option<Graph>, GpuError> {
         // Libraries load their kernels when they are first used, which no other capture may meet: one at a time.
         static ONE: Mutex<()> = Mutex::new(());
         let _one = ONE.lock().unwrap_or_else(PoisonError::into_inner);
         self.stream.synchronize().map_err(failed("waiting"))?;
         let mode = sys::CUstreamCaptureMode::CU_STREAM_CAPTURE_MODE_RELAXED;
         self.stream.begin_capture(mode).map_err(failed("beginning a capture"))?;
-        let captured = program.items.iter().try_for_each(|item| self.execute(&item.command, item.lane));
+        let captured = program.items.iter().try_for_each(|item| self.execute(&item.command, item.lane, runs));
         let made = self.stream.end_capture(sys::CUgraphInstantiate_flags(0));
         captured?;
         Ok(made.map_err(failed("capturing a program"))?.map(Graph))
     }
 
-    pub(super) fn time_parts(&mut self, program: &Finished) -> Result<Vec<PartTime>, GpuError> {
+    pub(super) fn time_parts(
+        &mut self,
+        program: &Finished,
+        runs: Runs<'_>,
+    ) -> Result<Vec<PartTime>, GpuError> {
         let mut times: Vec<PartTime> =
             program.parts.iter().map(|part| PartTime { part, commands: 0, ms: 0.0, flops: 0.0 }).collect();
         let event = |machine: &Self| {
@@ -234,9 +238,9 @@ impl Nvidia {
             if spans.last().is_none_or(|(last, _)| *last != item.part) {
                 spans.push((item.part, event(self)?));
             }
-            self.execute(&item.command, Lane::Main)?;
+            self.execute(&item.command, Lane::Main, runs)?;
             times[usize::from(item.part)].commands += 1;
-            times[usize::from(item.part)].flops += flops(&item.command);
+            times[usize::from(item.part)].flops += runs.count as f64 * flops(&item.command);
         }
         let end = event(self)?;
         self.stream.synchronize().map_err(failed("running a program"))?;
@@ -249,7 +253,11 @@ impl Nvidia {
     }
 
     /// Each distinct command of a program by itself: how often it is there, and how long it takes when it is repeated.
-    pub(super) fn time_commands(&mut self, program: &Finished) -> Result<Vec<CommandTime>, GpuError> {
+    pub(super) fn time_commands(
+        &mut self,
+        program: &Finished,
+        runs: Runs<'_>,
+    ) -> Result<Vec<CommandTime>, GpuError> {
         const REPEATS: u32 = 20;
         let mut kinds: Vec<(String, &Command, usize, &'static str)> = Vec::new();
         let mut places: HashMap<String, usize> = HashMap::new();
@@ -268,11 +276,11 @@ impl Nvidia {
         }
         let mut times = Vec::with_capacity(kinds.len());
         for (name, command, count, part) in kinds {
-            self.execute(command, Lane::Main)?;
+            self.execute(command, Lane::Main, runs)?;
             let flags = Some(sys::CUevent_flags::CU_EVENT_DEFAULT);
             let begin = self.stream.record_event(flags).map_err(failed("recording an event"))?;
             for _ in 0..REPEATS {
-                self.execute(command, Lane::Main)?;
+                self.execute(command, Lane::Main, runs)?;
             }
             let end = self.stream.record_event(flags).map_err(failed("recording an event"))?;
             end.synchronize().map_err(failed("running a command"))?;
@@ -283,13 +291,13 @@ impl Nvidia {
         Ok(times)
     }
 
-    fn execute(&self, command: &Command, lane: Lane) -> Result<(), GpuError> {
+    fn execute(&self, command: &Command, lane: Lane, runs: Runs<'_>) -> Result<(), GpuError> {
         let (stream, _) = self.lane(lane);
         match command {
             Command::Kernel { kernel, grid, p, n, f } => {
-                let args = Args::new(p, n, f);
+                let args = Args::new(p, n, f, runs);
                 let config = LaunchConfig {
-                    grid_dim: (grid.blocks as u32, 1, 1),
+                    grid_dim: (grid.blocks as u32, runs.count as u32, 1),
                     block_dim: (grid.threads as u32, 1, 1),
                     shared_mem_bytes: grid.shared_bytes as u32,
                 };
@@ -304,11 +312,11 @@ impl Nvidia {
                 let event = stream.record_event(None).map_err(failed("handing over"))?;
                 self.lane(lane.other()).0.wait(&event).map_err(failed("handing over"))
             }
-            Command::Product(product) => self.multiply(product, lane),
+            Command::Product(product) => self.multiply(product, lane, runs),
         }
     }
 
-    fn multiply(&self, p: &Product, lane: Lane) -> Result<(), GpuError> {
+    fn multiply(&self, p: &Product, lane: Lane, runs: Runs<'_>) -> Result<(), GpuError> {
         use blas_sys::cublasOperation_t::{CUBLAS_OP_N, CUBLAS_OP_T};
         let (m, n, k) = p.sizes();
         let operation = |transposed: bool| if transposed { CUBLAS_OP_T } else { CUBLAS_OP_N };
@@ -317,31 +325,53 @@ impl Nvidia {
             Precision::Tf32 => blas_sys::cublasComputeType_t::CUBLAS_COMPUTE_32F_FAST_TF32,
         };
         let (one, beta) = (1f32, if p.add { 1f32 } else { 0f32 });
-        let f32_type = blas_sys::cudaDataType_t::CUDA_R_32F;
+        let (one, beta) = ((&raw const one).cast(), (&raw const beta).cast());
+        let kind = blas_sys::cudaDataType_t::CUDA_R_32F;
+        let (a, b, c) = (begin(p.a), begin(p.b), begin(p.c));
+        let (a_at, b_at, c_at) = (a as *const c_void, b as *const c_void, c as *mut c_void);
+        let (a_row, b_row, c_row) = (p.a.stride as i32, p.b.stride as i32, p.c.stride as i32);
+        let of_a = operation(p.a_transposed);
+        let of_b = operation(p.b_transposed);
+        let (m, n, k) = (m as i32, n as i32, k as i32);
+        let handle = *self.lane(lane).1.handle();
+        let best = blas_sys::cublasGemmAlgo_t::CUBLAS_GEMM_DEFAULT;
         // cuBLAS counts columns first: the transposed product of the transposes.
-        // SAFETY: the matrices' sizes were checked when the product was added, and they lie in this machine's memory.
+        // SAFETY: the matrices' sizes were checked when the product was added, and they lie in this machine's memory, for each run.
         unsafe {
-            blas::gemm_ex(
-                *self.lane(lane).1.handle(),
-                operation(p.b_transposed),
-                operation(p.a_transposed),
-                n as i32,
-                m as i32,
-                k as i32,
-                (&raw const one).cast(),
-                begin(p.b) as *const c_void,
-                f32_type,
-                p.b.stride as i32,
-                begin(p.a) as *const c_void,
-                f32_type,
-                p.a.stride as i32,
-                (&raw const beta).cast(),
-                begin(p.c) as *mut c_void,
-                f32_type,
-                p.c.stride as i32,
-                compute,
-                blas_sys::cublasGemmAlgo_t::CUBLAS_GEMM_DEFAULT,
-            )
+            if runs.count == 1 {
+                blas::gemm_ex(
+                    handle, of_b, of_a, n, m, k, one, b_at, kind, b_row, a_at, kind, a_row, beta, c_at, kind,
+                    c_row, compute, best,
+                )
+            } else {
+                let apart = |address| (runs.apart(address) / 4) as i64;
+                let (a_apart, b_apart, c_apart) = (apart(a), apart(b), apart(c));
+                blas::gemm_strided_batched_ex(
+                    handle,
+                    of_b,
+                    of_a,
+                    n,
+                    m,
+                    k,
+                    one,
+                    b_at,
+                    kind,
+                    b_row,
+                    b_apart,
+                    a_at,
+                    kind,
+                    a_row,
+                    a_apart,
+                    beta,
+                    c_at,
+                    kind,
+                    c_row,
+                    c_apart,
+                    runs.count as i32,
+                    compute,
+                    best,
+                )
+            }
         }
         .map_err(failed("a matrix product"))
     }

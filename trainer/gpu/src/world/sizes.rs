@@ -5,7 +5,7 @@ use rcwm_models::settings::{ModelKind, ModelSettings};
 use crate::layers::Draw;
 
 /// Sizes of a batch and of the model.
-#[derive(Debug, Clone)]
+#[derive(Debug, Clone, PartialEq)]
 pub struct Sizes {
     pub model: ModelSettings,
     /// B, sequences.
@@ -16,6 +16,8 @@ pub struct Sizes {
     pub decode_every: usize,
     /// Whether draws are the most probable class and actions the mean, without noise: for comparisons.
     pub mode: bool,
+    /// Whether the encoders see other pictures than those that are decoded.
+    pub looks: bool,
 }
 
 impl Sizes {

@@ -1,0 +1,394 @@
+//! The memory and programs of all runs that learn together.
+
+use super::programs::{Optimiser, Programs, Room, check};
+use super::values::{Batch, BehaviourValues, Colours, Images, LearnerSettings, Noise, WorldValues};
+use crate::behaviour;
+use crate::machine::{CommandTime, GpuError, Machine, PartTime, Ready};
+use crate::program::Matrix;
+use crate::weights::{Array, Entry, Group, Weights};
+use crate::world;
+
+/// One of a learner's programs.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub(super) enum Which {
+    World { masks: bool },
+    Validation,
+    Behaviour,
+}
+
+/// World models, actors and critics on a machine: one of each for every run.
+#[derive(Debug)]
+pub(super) struct Runs {
+    machine: Machine,
+    weights: Weights,
+    settings: LearnerSettings,
+    room: Room,
+    optimisers: Vec<Optimiser>,
+    /// Steps of every parameter's optimiser, by run, in the weights' order.
+    steps: Vec<Vec<u64>>,
+    /// Which runs the last program moved.
+    taking_part: Vec<bool>,
+    programs: Programs,
+}
+
+impl Runs {
+    pub(super) fn new(
+        mut machine: Machine,
+        specs: &[(String, Vec<usize>)],
+        bins: &[f32],
+        settings: LearnerSettings,
+    ) -> Result<Self, GpuError> {
+        check(&settings)?;
+        let weights = Weights::new(&mut machine, specs, bins, settings.sizes.model.deter)?;
+        let room = Room::new(&mut machine, &settings)?;
+        let mut optimisers = Vec::new();
+        let mut wanted = vec![(Group::World, settings.world_adam)];
+        if let Some((_, actor, critic)) = settings.behaviour {
+            wanted.extend([(Group::Actor, actor), (Group::Critic, critic)]);
+        }
+        let clips = machine.allocate(8 * wanted.len())?;
+        for (at, (group, scales)) in wanted.into_iter().enumerate() {
+            let table = machine.allocate(8 * weights.entries().len())?;
+            optimisers.push(Optimiser { group, scales, table, clip: clips + 8 * at as u64 });
+        }
+        let programs = Programs::new(&mut machine, &weights, &settings, room, &optimisers)?;
+        let runs = machine.runs();
+        let steps = vec![vec![0; weights.entries().len()]; runs];
+        let taking_part = vec![false; runs];
+        Ok(Self { machine, weights, settings, room, optimisers, steps, taking_part, programs })
+    }
+
+    pub(super) fn entries(&self) -> &[Entry] {
+        self.weights.entries()
+    }
+
+    pub(super) fn settings(&self) -> &LearnerSettings {
+        &self.settings
+    }
+
+    pub(super) fn machine(&self) -> &Machine {
+        &self.machine
+    }
+
+    pub(super) fn set(
+        &mut self,
+        run: usize,
+        array: Array,
+        at: usize,
+        values: &[f32],
+    ) -> Result<(), GpuError> {
+        let Self { machine, weights, .. } = self;
+        weights.set(machine, (array, run), &weights.entries()[at], values)
+    }
+
+    pub(super) fn get(&mut self, run: usize, array: Array, at: usize) -> Result<Vec<f32>, GpuError> {
+        let Self { machine, weights, .. } = self;
+        weights.get(machine, (array, run), &weights.entries()[at])
+    }
+
+    pub(super) fn steps_mut(&mut self, run: usize) -> &mut [u64] {
+        &mut self.steps[run]
+    }
+
+    pub(super) fn set_range(&mut self, run: usize, range: [f64; 2]) -> Result<(), GpuError> {
+        self.machine.upload(address(self.room.range), run, &range.map(|x| x as f32))
+    }
+
+    pub(super) fn store(&mut self, from: usize, images: &[u8], masks: &[u8]) -> Result<(), GpuError> {
+        let image = 64 * 64 * 3;
+        let count = images.len() / image;
+        if from + count > self.settings.stored_images || (!masks.is_empty() && masks.len() != count * 4096) {
+            return Err(GpuError::Unsupported(format!(
+                "images {from} to {} do not fit a store of {}",
+                from + count,
+                self.settings.stored_images
+            )));
+        }
+        self.machine.upload(self.room.inputs.images + (from * image) as u64, 0, images)?;
+        if self.settings.stored_masks && !masks.is_empty() {
+            self.machine.upload(self.room.inputs.masks + (from * 4096) as u64, 0, masks)?;
+        }
+        Ok(())
+    }
+
+    /// Brings what a run's next update of the world model needs.
+    pub(super) fn bring_world(
+        &mut self,
+        run: usize,
+        batch: &Batch<'_>,
+        noise: Noise,
+        rate: impl Fn(&str) -> f64,
+    ) -> Result<(), GpuError> {
+        self.bring_batch(run, batch, noise)?;
+        self.bring_rates(run, 0, rate)?;
+        let number = batch.number as f64 + 1.0;
+        // The average begins as the weights after the first update.
+        let keep = if number > 1.0 {
+            self.settings.average_decay.min((1.0 + number) / (10.0 + number))
+        } else {
+            0.0
+        };
+        self.machine.upload(self.room.keep, run, &[keep as f32])
+    }
+
+    /// Brings what a run's next update of actor and critic needs.
+    pub(super) fn bring_behaviour(&mut self, run: usize, rate: impl Fn(&str) -> f64) -> Result<(), GpuError> {
+        if self.programs.behaviour.is_none() {
+            return Err(GpuError::Unsupported("this learner was made without actor and critic".to_owned()));
+        }
+        self.bring_rates(run, 1, &rate)?;
+        self.bring_rates(run, 2, &rate)
+    }
+
+    /// Runs a program; only the runs that take part are changed by it.
+    pub(super) fn launch(&mut self, which: Which, taking_part: Vec<bool>) -> Result<(), GpuError> {
+        let Self { machine, room, .. } = self;
+        for (run, takes_part) in taking_part.iter().enumerate() {
+            if self.taking_part[run] != *takes_part {
+                machine.upload(room.taking_part, run, &[u32::from(*takes_part)])?;
+            }
+        }
+        self.taking_part = taking_part;
+        let program = match which {
+            Which::World { masks: false } => Some(&self.programs.world),
+            Which::World { masks: true } => Some(&self.programs.masked),
+            Which::Validation => Some(&self.programs.validation),
+            Which::Behaviour => self.programs.behaviour.as_ref(),
+        };
+        program.map_or(Ok(()), |program| self.machine.run(program))
+    }
+
+    /// What the last update of a run's actor and critic was.
+    pub(super) fn behaviour_values(&mut self, run: usize) -> Result<BehaviourValues, GpuError> {
+        let mut scalars = [0f32; behaviour::SCALARS];
+        self.machine.download(address(self.room.behaviour_scalars), run, &mut scalars)?;
+        let mut range = [0f32; 2];
+        self.machine.download(address(self.room.range), run, &mut range)?;
+        let [actor_loss, critic_loss, entropy, reward, lambda_return, value] = scalars.map(f64::from);
+        let mut clips = [[0f32; 2]; 2];
+        self.machine.download(self.optimisers[1].clip, run, clips.as_flattened_mut())?;
+        let [actor_gradient_norm, critic_gradient_norm] = clips.map(|clip| f64::from(clip[0]));
+        let moved = clips.iter().all(|clip| clip[1] != 0.0);
+        let values = BehaviourValues {
+            actor_loss,
+            critic_loss,
+            actor_gradient_norm,
+            critic_gradient_norm,
+            entropy,
+            reward,
+            lambda_return,
+            value,
+            range: range.map(f64::from),
+            moved,
+        };
+        if moved {
+            self.count_step(run, 1);
+            self.count_step(run, 2);
+        }
+        Ok(values)
+    }
+
+    pub(super) fn time_parts(&mut self) -> Result<(Vec<PartTime>, Vec<PartTime>), GpuError> {
+        let world = self.machine.time_parts(&self.programs.world)?;
+        let behaviour = self.programs.behaviour.as_ref().map(|program| self.machine.time_parts(program));
+        Ok((world, behaviour.transpose()?.unwrap_or_default()))
+    }
+
+    pub(super) fn time_commands(&mut self) -> Result<(Vec<CommandTime>, Vec<CommandTime>), GpuError> {
+        let world = self.machine.time_commands(&self.programs.world)?;
+        let behaviour = self.programs.behaviour.as_ref().map(|program| self.machine.time_commands(program));
+        Ok((world, behaviour.transpose()?.unwrap_or_default()))
+    }
+
+    pub(super) fn commands(&self) -> (usize, usize) {
+        (self.programs.world.commands(), self.programs.behaviour.as_ref().map_or(0, Ready::commands))
+    }
+
+    pub(super) fn features(&mut self, run: usize) -> Result<Vec<f32>, GpuError> {
+        let mut features = vec![0.0; self.room.features.len()];
+        self.machine.download(address(self.room.features), run, &mut features)?;
+        Ok(features)
+    }
+
+    pub(super) fn kl(&mut self, run: usize, branch: usize) -> Result<Vec<f32>, GpuError> {
+        let rows = self.settings.sizes.rows();
+        let mut kl = vec![0.0; rows];
+        self.machine.download(self.room.inputs.kl + (4 * branch.min(1) * rows) as u64, run, &mut kl)?;
+        Ok(kl)
+    }
+
+    fn count_step(&mut self, run: usize, which: usize) {
+        let group = self.optimisers[which].group;
+        for (steps, entry) in self.steps[run].iter_mut().zip(self.weights.entries()) {
+            *steps += u64::from(entry.group == group);
+        }
+    }
+
+    fn bring_rates(&mut self, run: usize, which: usize, rate: impl Fn(&str) -> f64) -> Result<(), GpuError> {
+        let Some(Optimiser { scales, table, .. }) = self.optimisers.get(which).copied() else {
+            return Ok(());
+        };
+        let row = |(entry, steps): (&Entry, &u64)| {
+            let number = (*steps + 1).min(1 << 30) as i32;
+            let corrections = [scales.beta1, scales.beta2].map(|beta| 1.0 - beta.powi(number));
+            [(rate(&entry.name) / corrections[0]) as f32, (1.0 / corrections[1]) as f32]
+        };
+        let rows: Vec<f32> = self.weights.entries().iter().zip(&self.steps[run]).flat_map(row).collect();
+        self.machine.upload(table, run, &rows)
+    }
+
+    pub(super) fn bring_batch(
+        &mut self,
+        run: usize,
+        batch: &Batch<'_>,
+        noise: Noise,
+    ) -> Result<(), GpuError> {
+        let sizes = &self.settings.sizes;
+        let (b, t) = (sizes.batch, sizes.length);
+        let (rows, action) = (b * t, sizes.model.action);
+        let fits = batch.action.len() == rows * action
+            && [batch.reward.len(), batch.terminal.len(), batch.first.len()] == [rows; 3]
+            && (batch.shift.is_empty() || batch.shift.len() == b);
+        if !fits {
+            return Err(GpuError::Unsupported(format!("the batch is not one of {b} sequences of {t} steps")));
+        }
+        // Row t * B + b is step t of sequence b.
+        let from = |row: usize| row % b * t + row / b;
+        let begins = |row: usize| row < b || batch.first[from(row)];
+        let flags: Vec<u32> = (0..rows).map(|row| u32::from(begins(row))).collect();
+        let mut actions = vec![0.0; rows * action];
+        for row in (0..rows).filter(|row| !begins(*row)) {
+            for (to, x) in
+                actions[row * action..][..action].iter_mut().zip(&batch.action[from(row) * action..])
+            {
+                *to = x / x.abs().max(1.0);
+            }
+        }
+        let reward: Vec<f32> = (0..rows).map(|row| batch.reward[from(row)]).collect();
+        let terminal: Vec<f32> =
+            (0..rows).map(|row| f32::from(u8::from(batch.terminal[from(row)]))).collect();
+        let every = sizes.decode_every as u64;
+        let decoded: Vec<u32> = (0..rows as u32)
+            .filter(|row| (u64::from(*row) / b as u64 + batch.number).is_multiple_of(every))
+            .collect();
+        let mut control = [0u32; 10];
+        for (word, bytes) in control.iter_mut().zip(noise.key.as_chunks::<4>().0) {
+            *word = u32::from_le_bytes(*bytes);
+        }
+        [control[8], control[9]] = [noise.stream as u32, (noise.stream >> 32) as u32];
+        let shift = if batch.shift.is_empty() { vec![[0; 2]; b] } else { batch.shift.to_vec() };
+
+        let Room { inputs, batch_images, batch_masks, .. } = self.room;
+        let elsewhere = || {
+            let text = "the batch's images are not where they are expected".to_owned();
+            Err(GpuError::Unsupported(text))
+        };
+        let seen = batch.seen;
+        let looks = !(seen.host.is_empty() && seen.stored.is_empty() && seen.colours.is_empty());
+        if looks && !sizes.looks || !seen.colours.is_empty() && seen.colours.len() != b {
+            return elsewhere();
+        }
+        let colours: Vec<[f32; 8]> = (0..b)
+            .map(|row| match seen.colours.get(row).copied().flatten() {
+                Some(Colours { gain: [r, g, b], offset: [to_r, to_g, to_b], grey }) => {
+                    [r, g, b, to_r, to_g, to_b, grey, 1.0]
+                }
+                None => [0.0; 8],
+            })
+            .collect();
+        let mut seen_at: Option<Vec<u32>> = None;
+        let index: Vec<u32> = match batch.images {
+            Images::Stored(places)
+                if places.len() == rows
+                    && places.iter().all(|place| (*place as usize) < self.settings.stored_images)
+                    && (!batch.masks || self.settings.stored_masks) =>
+            {
+                if !seen.stored.is_empty() {
+                    let known = |place: &u32| (*place as usize) < self.settings.stored_images;
+                    if seen.stored.len() != rows || !seen.stored.iter().all(known) {
+                        return elsewhere();
+                    }
+                    seen_at = Some((0..rows).map(|row| seen.stored[from(row)]).collect());
+                }
+                (0..rows).map(|row| places[from(row)]).collect()
+            }
+            Images::Host(images, masks)
+                if images.len() == rows * 12288
+                    && self.settings.stored_images == 0
+                    && (!batch.masks || masks.len() == rows * 4096) =>
+            {
+                self.machine.upload(batch_images, run, images)?;
+                if batch.masks {
+                    self.machine.upload(batch_masks, run, masks)?;
+                }
+                if !seen.host.is_empty() {
+                    if seen.host.len() != images.len() {
+                        return elsewhere();
+                    }
+                    self.machine.upload(batch_images + images.len() as u64, run, seen.host)?;
+                    seen_at = Some((0..rows).map(|row| (rows + from(row)) as u32).collect());
+                }
+                (0..rows).map(|row| from(row) as u32).collect()
+            }
+            _ => return elsewhere(),
+        };
+        let machine = &mut self.machine;
+        machine.upload(inputs.index, run, &index)?;
+        machine.upload(inputs.seen, run, seen_at.as_ref().unwrap_or(&index))?;
+        machine.upload(inputs.colours, run, colours.as_flattened())?;
+        machine.upload(inputs.shift, run, &shift)?;
+        machine.upload(inputs.action, run, &actions)?;
+        machine.upload(inputs.reward, run, &reward)?;
+        machine.upload(inputs.terminal, run, &terminal)?;
+        machine.upload(inputs.first, run, &flags)?;
+        machine.upload(inputs.decoded, run, &decoded)?;
+        machine.upload(inputs.noise, run, &control)
+    }
+
+    /// What the last update of a run's world model was, or its validation.
+    pub(super) fn world_values(&mut self, run: usize, which: Which) -> Result<WorldValues, GpuError> {
+        let masks = which == Which::World { masks: true };
+        let mut scalars = [0f32; world::SCALARS];
+        self.machine.download(address(self.room.scalars), run, &mut scalars)?;
+        let mut clip = [0f32; 2];
+        self.machine.download(self.optimisers[0].clip, run, &mut clip)?;
+        let [image, mask, reward, continues, first, first_floored, second, second_floored] =
+            scalars.map(f64::from);
+        let scales = self.settings.world;
+        let factor = f64::from(scales.dynamics) + f64::from(scales.representation);
+        let mut total = f64::from(scales.image) * image
+            + f64::from(scales.reward) * reward
+            + f64::from(scales.continues) * continues
+            + factor * first_floored;
+        if self.settings.sizes.branches() == 2 {
+            total += factor * second_floored;
+        }
+        if masks {
+            total += f64::from(scales.mask) * mask;
+        }
+        let robot_mask = masks.then_some(mask);
+        let updated = which != Which::Validation;
+        let gradient_norm = if updated { f64::from(clip[0]) } else { 0.0 };
+        let moved = updated && clip[1] != 0.0;
+        if moved {
+            self.count_step(run, 0);
+        }
+        Ok(WorldValues {
+            image,
+            robot_mask,
+            reward,
+            continues,
+            kl: [first, second],
+            total,
+            gradient_norm,
+            moved,
+        })
+    }
+}
+
+fn address(matrix: Matrix) -> u64 {
+    match matrix.place {
+        crate::program::Buffer::Fixed(address) => address,
+        crate::program::Buffer::Transient(_) => unreachable!("a room has fixed places alone"),
+    }
+}
