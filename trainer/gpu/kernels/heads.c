@@ -92,7 +92,7 @@ KERNEL(scaled_sigmoid) {
 // p: out [rows, 2 actions], normal noise [rows, actions] (null: the mean), action (stride n[2]), entropy [rows].
 // n: rows, actions, stride of action, T, B: noise of row t * B + b is that of b * T + t (T 0: as it is).
 KERNEL(actor_draw) {
-    const float *out = (const float *)AT(0), *noise = (const float *)AT(1);
+    const float *out = (const float *)AT(0), *noise = (const float *)OR_NULL(1);
     FOR_ALL(r, a.n[0]) {
         float entropy = 0.0f;
         int from = a.n[3] > 0 ? r % a.n[4] * a.n[3] + r / a.n[4] : r;
@@ -109,7 +109,7 @@ KERNEL(actor_draw) {
 
 // p: out, noise, d_action (stride n[2]), d_entropy [rows], d_out (written). n as above. The divisor gets no gradient.
 KERNEL(actor_backward) {
-    const float *out = (const float *)AT(0), *noise = (const float *)AT(1), *d_action = (const float *)AT(2);
+    const float *out = (const float *)AT(0), *noise = (const float *)OR_NULL(1), *d_action = (const float *)AT(2);
     const float *d_entropy = (const float *)AT(3);
     float *dx = (float *)AT(4);
     FOR_ALL(r, a.n[0]) {
