@@ -35,6 +35,9 @@ const SOURCES: [&str; 10] = [
 /// Memory that cuBLAS works in: what NVIDIA recommends for Hopper.
 const WORKSPACE_BYTES: usize = 32 << 20;
 
+/// Terms of a sum up to which the products of several runs are one call.
+const LONGEST_TOGETHER: i32 = 2048;
+
 /// A GPU with a stream of its own.
 pub struct Nvidia {
     stream: Arc<CudaStream>,
@@ -338,11 +341,33 @@ impl Nvidia {
         // cuBLAS counts columns first: the transposed product of the transposes.
         // SAFETY: the matrices' sizes were checked when the product was added, and they lie in this machine's memory, for each run.
         unsafe {
-            if runs.count == 1 {
-                blas::gemm_ex(
-                    handle, of_b, of_a, n, m, k, one, b_at, kind, b_row, a_at, kind, a_row, beta, c_at, kind,
-                    c_row, compute, best,
-                )
+            if runs.count == 1 || k > LONGEST_TOGETHER {
+                // Several at once are not split along a long sum, which leaves most of the GPU idle.
+                (0..runs.count).try_for_each(|run| {
+                    let of_run = |address: u64| address + (run * runs.apart(address)) as u64;
+                    let (a_at, b_at) = (of_run(a) as *const c_void, of_run(b) as *const c_void);
+                    blas::gemm_ex(
+                        handle,
+                        of_b,
+                        of_a,
+                        n,
+                        m,
+                        k,
+                        one,
+                        b_at,
+                        kind,
+                        b_row,
+                        a_at,
+                        kind,
+                        a_row,
+                        beta,
+                        of_run(c) as *mut c_void,
+                        kind,
+                        c_row,
+                        compute,
+                        best,
+                    )
+                })
             } else {
                 let apart = |address| (runs.apart(address) / 4) as i64;
                 let (a_apart, b_apart, c_apart) = (apart(a), apart(b), apart(c));
