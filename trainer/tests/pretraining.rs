@@ -180,11 +180,11 @@ fn resumed_is_the_same_as_whole(compute: impl Fn() -> Compute) {
     }
 }
 
+/// A run's weights, and what they give on held-out episodes.
+type Learned = (Vec<(String, Vec<u32>)>, serde_json::Value);
+
 /// Runs of these seeds, numbers of updates and folders, each in a thread of its own; what they have learned.
-fn learn_together(
-    runs: &[(u64, u64, &Path)],
-    computes: Vec<Compute>,
-) -> Vec<(Vec<(String, Vec<u32>)>, serde_json::Value)> {
+fn learn_together(runs: &[(u64, u64, &Path)], computes: Vec<Compute>) -> Vec<Learned> {
     std::thread::scope(|scope| {
         let thread = |(&(seed, updates, folder), compute): (&(u64, u64, &Path), Compute)| {
             let (folder, compute) = (folder.to_owned(), compute);
@@ -206,9 +206,7 @@ fn learn_together(
 }
 
 /// Three runs of which one is shorter, and one begins where it was stopped before: they ask for different updates at once.
-fn alone_and_together(
-    machine: impl Fn() -> Machine,
-) -> [Vec<(Vec<(String, Vec<u32>)>, serde_json::Value)>; 2] {
+fn alone_and_together(machine: impl Fn() -> Machine) -> [Vec<Learned>; 2] {
     let folder = tempfile::tempdir().unwrap();
     let path = |name: &str| folder.path().join(name);
     let runs = [(1, 12), (2, 7), (3, 12)];
