@@ -62,6 +62,8 @@ fn plan<'a>(
         model,
         batch: (ROWS, LENGTH),
         world,
+        imitation: None,
+        in_stages: false,
         behaviour,
         average_decay: 0.0,
         stored: &[],

@@ -13,20 +13,22 @@ use candle_core::{Device, Tensor};
 use ndarray::{Array1, Array2, Array4};
 use rand::{Rng, SeedableRng};
 use rand_chacha::ChaCha8Rng;
+use rcwm_gpu::Machine;
 use rcwm_models::IMAGE_BYTES;
 use rcwm_models::episode::Episode;
 use rcwm_models::settings::{ModelKind, Preset};
 use rcwm_trainer::behaviour::BehaviourSettings;
 use rcwm_trainer::checkpoint::Checkpoint;
 use rcwm_trainer::cloning::{CloningLearner, CloningSettings, Ramp};
+use rcwm_trainer::gpu::Share;
 use rcwm_trainer::learning::{CloningLoss, Examples, actions_taken};
 use rcwm_trainer::learning::{HostBatch, Side, side_of};
 use rcwm_trainer::model::latent::Sampler;
 use rcwm_trainer::model::parameters::Parameters;
 use rcwm_trainer::replay::{Replay, Starts};
 use rcwm_trainer::training::{
-    Fewshot, FewshotSettings, Outcome, Phase, Pretraining, Reset, ResetSettings, Run, Stage, TrainingError,
-    TrainingSettings, demonstrations, start_from,
+    Compute, Fewshot, FewshotSettings, Outcome, Phase, Pretraining, Reset, ResetSettings, Run, Stage,
+    TrainingError, TrainingSettings, demonstrations, start_from,
 };
 
 /// A bright square that moves with the action, to and fro.
@@ -183,12 +185,84 @@ fn updates_logged(folder: &Path) -> Vec<u64> {
 
 #[test]
 fn few_shot_learning_that_was_interrupted_in_any_stage_gives_the_same_weights() {
-    for (kind, world_goes_on, imitates) in [
+    let cases = [
         (ModelKind::Rcwm, false, false),
         (ModelKind::Rcwm, true, false),
         (ModelKind::Rcwm, false, true),
         (ModelKind::Vanilla, false, true),
+    ];
+    interrupted_is_the_same_as_whole(|| (&Device::Cpu).into(), &cases);
+}
+
+fn programs() -> Compute {
+    Compute::Programs(Share::alone(Machine::host()))
+}
+
+#[test]
+fn few_shot_learning_by_programs_does_too() {
+    let cases = [(ModelKind::Rcwm, false, true), (ModelKind::Vanilla, false, false)];
+    interrupted_is_the_same_as_whole(programs, &cases);
+}
+
+#[test]
+fn few_shot_learning_by_programs_learns_what_tensors_learn() {
+    for (kind, loss, scale) in [
+        (ModelKind::Rcwm, CloningLoss::SquaredError, 10.0),
+        (ModelKind::Rcwm, CloningLoss::Likelihood, 10.0),
+        (ModelKind::Rcwm, CloningLoss::SquaredError, 0.0),
+        (ModelKind::Vanilla, CloningLoss::SquaredError, 10.0),
     ] {
+        let source = pretrained(kind);
+        let run = |compute: Compute| {
+            let folder = tempfile::tempdir().unwrap();
+            let mut settings = settings(kind);
+            settings.metrics_every = 1;
+            settings.world.environment_learning_rate = 2.0 * settings.world.adam.learning_rate;
+            settings.fewshot.imitation_scale = scale;
+            settings.fewshot.cloning.loss = loss;
+            settings.fewshot.shift = 2;
+            let mut learning = Fewshot::create(folder.path(), settings, &source, compute).unwrap();
+            learn(&mut learning, 8);
+            let text = fs::read_to_string(folder.path().join("metrics.jsonl")).unwrap();
+            text.lines()
+                .map(|line| serde_json::from_str::<serde_json::Value>(line).unwrap())
+                .collect::<Vec<_>>()
+        };
+        let (tensors, programs) = (run((&Device::Cpu).into()), run(programs()));
+        assert_eq!((tensors.len(), programs.len()), (8, 8));
+        for (at, (expected, found)) in tensors.iter().zip(&programs).enumerate() {
+            for (values, name) in [("losses", "cloning"), ("losses", "total"), ("losses", "image")] {
+                let value = |line: &serde_json::Value| line[values][name].as_f64();
+                assert_eq!(value(expected).is_some(), name != "cloning" || scale > 0.0);
+                let (Some(expected), Some(found)) = (value(expected), value(found)) else { continue };
+                let tolerance = if at == 0 { 1e-4 } else { 2e-2 };
+                let text = format!("{kind:?} {loss:?} update {at}: {name} {found}, expected {expected}");
+                assert!((found - expected).abs() <= tolerance * expected.abs().max(1.0), "{text}");
+            }
+            // The norm is of all that is trained, the actor too.
+            let norm = |line: &serde_json::Value| line["gradient_norm"].as_f64().unwrap();
+            let (expected, found) = (norm(expected), norm(found));
+            let tolerance = if at == 0 { 1e-3 } else { 0.1 };
+            assert!(
+                (found - expected).abs() <= tolerance * expected,
+                "{kind:?} {at}: norm {found}, expected {expected}"
+            );
+        }
+    }
+}
+
+#[test]
+fn a_world_model_that_goes_on_with_the_actor_is_refused_on_a_gpu() {
+    let folder = tempfile::tempdir().unwrap();
+    let mut settings = settings(ModelKind::Rcwm);
+    settings.fewshot.world_goes_on = true;
+    let refused = Fewshot::create(folder.path(), settings, &pretrained(ModelKind::Rcwm), programs());
+    assert!(refused.unwrap_err().to_string().contains("fewshot.world_goes_on"));
+}
+
+/// Cases are a kind of model, whether the world model goes on with the actor, and whether the actor has a part in its loss.
+fn interrupted_is_the_same_as_whole(compute: impl Fn() -> Compute, cases: &[(ModelKind, bool, bool)]) {
+    for &(kind, world_goes_on, imitates) in cases {
         let folder = tempfile::tempdir().unwrap();
         let (whole, parts) = (folder.path().join("whole"), folder.path().join("parts"));
         let mut settings = settings(kind);
@@ -200,17 +274,17 @@ fn few_shot_learning_that_was_interrupted_in_any_stage_gives_the_same_weights() 
             settings.world.decode_every = 2;
         }
         let source = pretrained(kind);
-        let mut learning = Fewshot::create(&whole, settings.clone(), &source, &Device::Cpu).unwrap();
+        let mut learning = Fewshot::create(&whole, settings.clone(), &source, compute()).unwrap();
         assert_eq!(learn(&mut learning, u64::MAX), Outcome { updates: 20, interrupted: false });
         assert!(whole.join("films/000020-hammer.png").exists() && whole.join("curves.png").exists());
         let expected = bits(learning.parameters());
 
-        let mut learning = Fewshot::create(&parts, settings.clone(), &source, &Device::Cpu).unwrap();
+        let mut learning = Fewshot::create(&parts, settings.clone(), &source, compute()).unwrap();
         for stop in [2, 6, 12, 13, u64::MAX] {
             learn(&mut learning, stop);
             assert_eq!(learning.updates(), stop.min(20));
             drop(learning);
-            learning = Fewshot::resume(&parts, Run::settings(&parts).unwrap(), &Device::Cpu).unwrap();
+            learning = Fewshot::resume(&parts, Run::settings(&parts).unwrap(), compute()).unwrap();
         }
         assert!(
             bits(learning.parameters()) == expected,

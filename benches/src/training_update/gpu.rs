@@ -252,6 +252,8 @@ fn make(case: &Case, share: &Share, seed: u64) -> Result<(GpuLearner, Vec<u32>)>
         model: &case.settings,
         batch: (case.scale.batch, case.scale.length),
         world: &world,
+        imitation: None,
+        in_stages: false,
         behaviour: Some(&behaviour),
         average_decay: 0.0,
         stored: &[placed],

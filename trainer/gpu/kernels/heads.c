@@ -107,6 +107,32 @@ KERNEL(actor_draw) {
     }
 }
 
+// The distance of the actor's distribution from actions that were demonstrated, with its gradient: squared error of the mean, or the negative
+// log-likelihood in nats where n[2]. p: out [rows, 2 actions], demonstrated [rows, actions], weight [rows], loss [rows] (weighted), d_out.
+// n: rows, actions, likelihood. f: factor of the gradient.
+KERNEL(cloning_loss) {
+    const float *out = (const float *)AT(0), *wanted = (const float *)AT(1), *weight = (const float *)AT(2);
+    float *loss = (float *)AT(3), *dx = (float *)AT(4);
+    FOR_ALL(r, a.n[0]) {
+        float sum = 0.0f, factor = a.f[0] * weight[r];
+        for (int j = 0; j < a.n[1]; j++) {
+            float mean = tanhf(out[2 * r * a.n[1] + j]), error = mean - wanted[r * a.n[1] + j], d_mean, d_spread = 0.0f;
+            if (a.n[2]) {
+                float s = sigmoid_of(out[(2 * r + 1) * a.n[1] + j] + 2.0f), std = 0.9f * s + 0.1f, scaled = error / std;
+                sum += 0.5f * scaled * scaled + 0.91893853320467274178f + logf(std);
+                d_mean = scaled / std;
+                d_spread = (1.0f - scaled * scaled) / std * 0.9f * s * (1.0f - s);
+            } else {
+                sum += error * error;
+                d_mean = 2.0f * error;
+            }
+            dx[2 * r * a.n[1] + j] = factor * d_mean * (1.0f - mean * mean);
+            dx[(2 * r + 1) * a.n[1] + j] = factor * d_spread;
+        }
+        loss[r] = weight[r] * sum;
+    }
+}
+
 // p: out, noise, d_action (stride n[2]), d_entropy [rows], d_out (written). n as above. The divisor gets no gradient.
 KERNEL(actor_backward) {
     const float *out = (const float *)AT(0), *noise = (const float *)OR_NULL(1), *d_action = (const float *)AT(2);

@@ -12,7 +12,7 @@ macro_rules! each_kernel {
             InteractionForward interaction_forward, InteractionBackward interaction_backward,
             Windows windows, FromWindows from_windows, GatherImages gather_images, GatherSeen gather_seen, PictureLoss picture_loss,
             TwoHotLoss two_hot_loss, TwoHotMean two_hot_mean, ContinueLoss continue_loss, ScaledSigmoid scaled_sigmoid,
-            ActorDraw actor_draw, ActorBackward actor_backward, LambdaReturns lambda_returns, ActorLoss actor_loss,
+            ActorDraw actor_draw, ActorBackward actor_backward, CloningLoss cloning_loss, LambdaReturns lambda_returns, ActorLoss actor_loss,
             ReturnRange return_range, Squares squares, Clip clip, Adam adam, Mix mix,
             NarrowForward narrow_forward, NarrowBackward narrow_backward,
             ProductFewRows product_few_rows, ProductFewRowsBack product_few_rows_back,

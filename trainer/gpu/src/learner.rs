@@ -101,8 +101,11 @@ impl Learner {
         noise: Noise,
         rate: impl Fn(&str) -> f64,
     ) -> Result<WorldValues, GpuError> {
-        self.meeting.with(|runs| runs.bring_world(self.run, batch, noise, rate))?;
-        let which = Which::World { masks: batch.masks };
+        let which = match batch.environment_alone {
+            true => Which::Environment,
+            false => Which::World { masks: batch.masks },
+        };
+        self.meeting.with(|runs| runs.bring_world(self.run, (which, batch), noise, rate))?;
         self.meeting.launch(self.run, which, |runs| runs.world_values(self.run, which))
     }
 

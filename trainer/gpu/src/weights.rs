@@ -162,7 +162,13 @@ impl Weights {
     /// A group in one of the arrays, as one row.
     #[must_use]
     pub fn group(&self, array: Array, group: Group) -> Matrix {
-        let range = self.range(group);
+        self.groups(array, (group, group))
+    }
+
+    /// Groups that lie one after the other, from the first to the last, as one row.
+    #[must_use]
+    pub fn groups(&self, array: Array, (first, last): (Group, Group)) -> Matrix {
+        let range = self.range(first).start..self.range(last).end;
         Matrix::fixed(self.arrays[array as usize] + 4 * range.start as u64, 1, range.len())
     }
 

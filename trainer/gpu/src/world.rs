@@ -59,10 +59,23 @@ pub struct Inputs {
     pub noise: u64,
     /// Where each branch's KL goes, [2, T B].
     pub kl: u64,
+    /// Actions that were demonstrated in the states, [T B, action], and what each counts, [T B].
+    pub demonstrated: u64,
+    pub counts: u64,
 }
 
-/// Losses on the machine, each a number: image, mask, reward, continue, and for each branch its KL and its KL raised to the free nats.
-pub const SCALARS: usize = 8;
+/// The actor's part in the world model's loss.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct ImitationScales {
+    /// Factor of the distance from what was demonstrated.
+    pub scale: f32,
+    /// Whether the distance is the negative log-likelihood, or the squared error of the mean.
+    pub likelihood: bool,
+}
+
+/// Losses on the machine, each a number: image, mask, reward, continue, for each branch its KL and its KL raised to the free nats, and the actor's
+/// distance from what was demonstrated.
+pub const SCALARS: usize = 9;
 
 /// Gumbel or normal noise from word `from` on.
 pub fn noise(tape: &mut Tape, control: u64, rows: usize, cols: usize, normal: bool, from: u64) -> Matrix {
@@ -81,7 +94,7 @@ pub fn losses(
     source: Source<'_>,
     sizes: &Sizes,
     inputs: Inputs,
-    (scales, masks): (WorldScales, bool),
+    (scales, imitation, masks): (WorldScales, Option<ImitationScales>, bool),
     (features, scalars): (Matrix, Matrix),
 ) {
     tape.track(features);
@@ -97,6 +110,10 @@ pub fn losses(
     decoded(tape, source, sizes, inputs, (images, masks, features), scales, scalars);
     tape.program.part("heads");
     other_losses(tape, source, sizes, inputs, &pairs, scales, (features, scalars));
+    if let Some(imitation) = imitation {
+        tape.program.part("imitate");
+        cloning_loss(tape, source, inputs, imitation, (features, scalars));
+    }
     tape.run_backward();
 }
 
@@ -316,12 +333,33 @@ fn decoded(
     }
 }
 
+fn cloning_loss(
+    tape: &mut Tape,
+    source: Source<'_>,
+    inputs: Inputs,
+    imitation: ImitationScales,
+    (features, scalars): (Matrix, Matrix),
+) {
+    let out = tape.mlp(features, &source.mlp("actor"), true);
+    let (rows, actions) = (out.rows, out.cols / 2);
+    let (loss, d) = (tape.matrix(1, rows), tape.gradient_overwritten(out));
+    let demonstrated = Matrix::fixed(inputs.demonstrated, rows, actions);
+    let p = [out, demonstrated, Matrix::fixed(inputs.counts, rows, 1), loss, d].map(Pointer::from);
+    let n = [rows, actions, usize::from(imitation.likelihood)];
+    tape.program.kernel(Kernel::CloningLoss, Grid::elements(rows), &p, &n, &[imitation.scale]);
+    sum(tape, loss, scalars, 8, None, 1.0);
+}
+
 /// The mean of numbers, each raised to a floor where there is one, to a place of the scalars.
 pub fn mean(tape: &mut Tape, x: Matrix, scalars: Matrix, at: usize, floor: Option<f32>) {
+    sum(tape, x, scalars, at, floor, 1.0 / x.len() as f32);
+}
+
+fn sum(tape: &mut Tape, x: Matrix, scalars: Matrix, at: usize, floor: Option<f32>, factor: f32) {
     let p = [x.into(), scalars.columns(at..at + 1).into()];
     let grid = Grid { blocks: 1, threads: 512, shared_bytes: 0 };
     let n = [x.len(), usize::from(floor.is_some())];
-    tape.program.kernel(Kernel::SumOf, grid, &p, &n, &[1.0 / x.len() as f32, floor.unwrap_or_default()]);
+    tape.program.kernel(Kernel::SumOf, grid, &p, &n, &[factor, floor.unwrap_or_default()]);
 }
 
 fn other_losses(

@@ -57,14 +57,14 @@ pub struct Fewshot {
     /// Go on with the run in --out from its newest checkpoint
     #[arg(long)]
     resume: bool,
-    /// Where to compute: cpu, cuda or cuda:N
-    #[arg(long, default_value = "cpu")]
-    device: String,
+    #[command(flatten)]
+    compute: super::ComputeArguments,
 }
 
 impl Fewshot {
     pub fn run(self) -> Result<ExitCode> {
-        let device = super::parse_device(&self.device)?;
+        let compute = self.compute.compute()?;
+        let device = compute.device();
         let stop = super::stop_on_ctrl_c()?;
         if !self.resume && self.out.join("settings.toml").exists() {
             return Err(TrainingError::Exists { path: self.out }.into());
@@ -77,8 +77,8 @@ impl Fewshot {
         settings.validate()?;
         let replay = load(&settings)?;
         let mut learning = match &source {
-            Some(source) => Learning::create(&self.out, settings.clone(), source, &device)?,
-            None => Learning::resume(&self.out, settings.clone(), &device)?,
+            Some(source) => Learning::create(&self.out, settings.clone(), source, compute)?,
+            None => Learning::resume(&self.out, settings.clone(), compute)?,
         };
         let bar = bars::updates(settings.fewshot.updates(), learning.updates());
         let bar = bars::Bar::new(bar, "", "updates");

@@ -26,6 +26,7 @@ use clap::{Parser, Subcommand, ValueEnum};
 use rcwm_gpu::{Machine, Precision};
 use rcwm_models::files::Output;
 use rcwm_models::settings::{self, ModelKind, ModelSettings, Preset};
+use rcwm_trainer::gpu::Share;
 use rcwm_trainer::training::Compute;
 
 /// Learns the Robo-Centric World Model and exports it.
@@ -179,6 +180,14 @@ impl ComputeArguments {
         Ok(match self.machine()? {
             None => (0..runs).map(|_| Compute::Tensors(Device::Cpu)).collect(),
             Some(machine) => Compute::programs(machine.for_runs(runs)),
+        })
+    }
+
+    /// Where one run is computed.
+    fn compute(&self) -> Result<Compute> {
+        Ok(match self.machine()? {
+            None => Compute::Tensors(Device::Cpu),
+            Some(machine) => Compute::Programs(Share::alone(machine)),
         })
     }
 

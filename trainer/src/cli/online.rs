@@ -59,7 +59,7 @@ impl Online {
         source: Option<&Checkpoint>,
         begin: impl FnOnce() -> Result<TrainingSettings>,
     ) -> Result<ExitCode> {
-        let Some(compute) = self.compute.computes(1)?.pop() else { anyhow::bail!("one run has one place") };
+        let compute = self.compute.compute()?;
         let stop = super::stop_on_ctrl_c()?;
         if !self.resume && self.out.join("settings.toml").exists() {
             return Err(TrainingError::Exists { path: self.out.clone() }.into());

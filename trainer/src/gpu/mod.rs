@@ -12,13 +12,14 @@ use rand::SeedableRng;
 use rand_chacha::ChaCha8Rng;
 use rcwm_gpu::learner::{AdamScales, Colours, Images, Noise, Seen};
 use rcwm_gpu::weights::{Array, Group};
-use rcwm_gpu::world::{Sizes, WorldScales};
+use rcwm_gpu::world::{ImitationScales, Sizes, WorldScales};
 use rcwm_gpu::{BehaviourValues, GpuError, Learner, LearnerSettings, WorldValues};
 use rcwm_models::settings::{ModelKind, ModelSettings};
 
 use crate::behaviour::{BehaviourSettings, BehaviourUpdate, ReturnRange};
 use crate::learning::{
-    Adam, AdamSettings, HostBatch, Jitter, LearningError, LossValues, Moments, Side, WorldSettings, side_of,
+    Adam, AdamSettings, CloningLoss, HostBatch, Imitation, Jitter, LearningError, LossValues, Moments, Side,
+    WorldSettings, side_of,
 };
 use crate::model::agent;
 use crate::model::parameters::Parameters;
@@ -36,6 +37,10 @@ pub struct GpuPlan<'a> {
     pub batch: (usize, usize),
     /// The world model's losses and optimiser.
     pub world: &'a WorldSettings,
+    /// The actor's part in the world model's loss, where it has one.
+    pub imitation: Option<Imitation>,
+    /// Whether some updates are of the environment's side alone.
+    pub in_stages: bool,
     /// Actor and critic, where they learn.
     pub behaviour: Option<&'a BehaviourSettings>,
     /// Decay of the running average of the weights; 0: none.
@@ -54,6 +59,7 @@ pub struct GpuLearner {
     learner: Learner,
     kind: ModelKind,
     world: WorldSettings,
+    imitation: Option<Imitation>,
     behaviour: Option<BehaviourSettings>,
 }
 
@@ -105,6 +111,11 @@ impl GpuLearner {
             sizes,
             world: scales,
             world_adam: adam_scales(&world.adam),
+            imitation: plan.imitation.map(|imitation| ImitationScales {
+                scale: imitation.scale as f32,
+                likelihood: imitation.loss == CloningLoss::Likelihood,
+            }),
+            in_stages: plan.in_stages,
             behaviour: behaviour.map(|behaviour| {
                 (behaviour_scales(behaviour), adam_scales(&behaviour.actor), adam_scales(&behaviour.critic))
             }),
@@ -117,7 +128,8 @@ impl GpuLearner {
         let bring = |learner: &mut Learner| stored.iter().try_for_each(|placed| store(learner, placed));
         let learner = share.learner(&specs, &bins, settings, bring)?;
         let kind = model.kind;
-        let mut this = Self { learner, kind, world: (*world).clone(), behaviour: behaviour.cloned() };
+        let (world, behaviour, imitation) = ((*world).clone(), behaviour.cloned(), plan.imitation);
+        let mut this = Self { learner, kind, world, imitation, behaviour };
         this.load(Array::Values, parameters)?;
         this.load(Array::Average, parameters)?;
         Ok(this)
@@ -168,13 +180,15 @@ impl GpuLearner {
         Ok(())
     }
 
-    /// The optimiser of the world model, the actor or the critic as it is now.
+    /// The optimiser of the world model (with the actor, where it has a part in the loss), the actor or the critic as it is now.
     pub fn adam(&mut self, group: Group, parameters: &Parameters) -> Result<Adam, LearningError> {
+        let with_actor = group == Group::World && self.imitation.is_some();
+        let belongs = |of: Group| of == group || with_actor && of == Group::Actor;
         let mut all = BTreeMap::new();
         for at in 0..self.learner.entries().len() {
             let entry = self.learner.entries()[at].clone();
             let steps = self.learner.steps(at);
-            if entry.group != group || steps == 0 {
+            if !belongs(entry.group) || steps == 0 {
                 continue;
             }
             let var = |values: Vec<f32>| {
@@ -209,11 +223,41 @@ impl GpuLearner {
         shift: &[[i32; 2]],
         noise: Noise,
     ) -> Result<GpuWorldUpdate, LearningError> {
+        self.update_from(batch, (images, shift), noise, false)
+    }
+
+    /// One update of the environment's side alone, and of the actor where it has a part in the loss, from a batch that brings its images.
+    ///
+    /// # Errors
+    /// As [`GpuLearner::update_world`].
+    pub fn update_environment(
+        &mut self,
+        batch: &HostBatch,
+        noise: Noise,
+    ) -> Result<GpuWorldUpdate, LearningError> {
+        let images = Images::Host(&batch.image, &batch.robot_mask);
+        self.update_from(batch, (images, &[]), noise, true)
+    }
+
+    fn update_from(
+        &mut self,
+        batch: &HostBatch,
+        (images, shift): (Images<'_>, &[[i32; 2]]),
+        noise: Noise,
+        environment_alone: bool,
+    ) -> Result<GpuWorldUpdate, LearningError> {
         let (rate, environment) = (self.world.adam.learning_rate, self.world.environment_learning_rate);
+        let of_actor = self.imitation.map_or(rate, |imitation| imitation.learning_rate);
         let colours = colours(batch);
-        let batch = on_gpu(batch, images, &colours, shift);
+        let examples = if self.imitation.is_some() { batch.examples() } else { Vec::new() };
+        let batch = rcwm_gpu::Batch {
+            examples: &examples,
+            environment_alone,
+            ..on_gpu(batch, images, &colours, shift)
+        };
         let values = self.learner.update_world(&batch, noise, |name| match side_of(name) {
             Side::Environment if environment > 0.0 => environment,
+            Side::Actor => of_actor,
             _ => rate,
         })?;
         finite("the loss", values.total)?;
@@ -269,7 +313,7 @@ impl GpuLearner {
             robot_mask: values.robot_mask,
             reward: values.reward,
             continues: values.continues,
-            cloning: None,
+            cloning: values.cloning,
             robot_kl: values.kl[0],
             environment_kl: (self.kind == ModelKind::Rcwm).then_some(values.kl[1]),
         }
@@ -323,6 +367,8 @@ fn on_gpu<'a>(
         reward: &batch.reward,
         terminal: &batch.terminal,
         first: &batch.first,
+        examples: &[],
+        environment_alone: false,
         masks: batch.masks,
         number: batch.number,
         shift,

@@ -84,7 +84,18 @@ pub struct HostBatch {
     pub number: u64,
 }
 
+/// Which of B * T steps are examples for an actor: the action of the next step was taken in their state, and is no push.
+pub(super) fn examples(first: &[bool], pushed: &[bool], length: usize) -> impl Iterator<Item = bool> {
+    (0..first.len()).map(move |at| !(at + 1).is_multiple_of(length) && !first[at + 1] && !pushed[at + 1])
+}
+
 impl HostBatch {
+    /// Which of the B * T steps are examples for an actor.
+    #[must_use]
+    pub fn examples(&self) -> Vec<bool> {
+        examples(&self.first, &self.pushed, self.length).collect()
+    }
+
     /// The batch as tensors on `device`.
     ///
     /// # Errors

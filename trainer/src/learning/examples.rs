@@ -7,6 +7,7 @@ use rcwm_models::episode::Episode;
 use rcwm_models::settings::{ModelKind, ModelSettings};
 use rcwm_models::{ACTION_LEN, IMAGE_CHANNELS, IMAGE_SIDE};
 
+use super::batch::examples;
 use super::{Batch, Shift};
 use crate::model::agent::Agent;
 use crate::model::latent::{FirstSteps, Latent, Sampler, State};
@@ -75,9 +76,8 @@ impl Examples {
     pub fn places_in(batch: &Batch) -> Vec<u32> {
         let (first, pushed) = (batch.first.flags(), &batch.pushed);
         let length = first.len() / batch.first.batch().max(1);
-        let goes_on =
-            |index: &usize| !(index + 1).is_multiple_of(length) && !first[index + 1] && !pushed[index + 1];
-        (0..first.len()).filter(goes_on).map(|index| index as u32).collect()
+        let examples = examples(first, pushed, length).enumerate();
+        examples.filter_map(|(at, example)| example.then_some(at as u32)).collect()
     }
 
     /// The examples in a batch, from its posterior features [B, T, state width]: features [N, state width] and actions [N, action].

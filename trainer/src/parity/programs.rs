@@ -27,6 +27,8 @@ impl Programs {
             model: &reference.settings,
             batch: (reference.batch, reference.length),
             world: &settings,
+            imitation: None,
+            in_stages: false,
             behaviour: Some(&behaviour),
             average_decay: 0.0,
             stored: &[],

@@ -8,7 +8,7 @@ use rcwm_gpu::weights::{Array, Group};
 use super::{Run, TrainingError, TrainingSettings};
 use crate::behaviour::{BehaviourLearner, BehaviourUpdate, ReturnRange};
 use crate::gpu::{GpuLearner, GpuPlan, Share, numbered_noise};
-use crate::learning::{Adam, HostBatch, LossValues, Trained, WorldLearner};
+use crate::learning::{Adam, HostBatch, Imitation, LossValues, Trained, WorldLearner};
 use crate::model::latent::Sampler;
 use crate::model::parameters::Parameters;
 use crate::replay::Replay;
@@ -68,6 +68,12 @@ pub(super) enum WorldUpdates {
     },
     Programs {
         learner: Box<GpuLearner>,
+        /// Whether updates are of the environment's side alone for now.
+        environment: bool,
+    },
+    /// The world model's part of the run is over, and the programs are gone.
+    Done {
+        adam: Adam,
     },
 }
 
@@ -114,16 +120,69 @@ impl WorldUpdates {
             model: &settings.model,
             batch: (settings.replay.batch, settings.replay.length),
             world: &settings.world,
+            imitation: None,
+            in_stages: false,
             behaviour: None,
             average_decay: settings.average_decay,
             stored: &episodes,
             looks: !settings.replay.look.is_plain(),
             mode: false,
         };
-        let mut learner = GpuLearner::new(share, &plan, parameters)?;
+        let learner = Self::learner(share, &plan, (parameters, run), adam)?;
+        *self = Self::Programs { learner, environment: false };
+        Ok(())
+    }
+
+    /// Trains this part of the model from now on, the actor with it where it has a part in the loss. Batches bring their images.
+    pub fn train(
+        &mut self,
+        settings: &TrainingSettings,
+        (parameters, run): (&Parameters, &Run),
+        trained: Trained,
+        imitation: Option<Imitation>,
+    ) -> Result<(), TrainingError> {
+        let alone = matches!(trained, Trained::Environment | Trained::EnvironmentAndActor);
+        match self {
+            Self::Tensors { learner, .. } => learner.train(trained, imitation)?,
+            Self::Programs { environment, .. } => *environment = alone,
+            Self::Waiting { share, adam } => {
+                let plan = GpuPlan {
+                    model: &settings.model,
+                    batch: (settings.replay.batch, settings.replay.length),
+                    world: &settings.world,
+                    imitation,
+                    in_stages: true,
+                    behaviour: None,
+                    average_decay: settings.average_decay,
+                    stored: &[],
+                    looks: !settings.replay.look.is_plain(),
+                    mode: false,
+                };
+                let learner = Self::learner(share, &plan, (parameters, run), adam)?;
+                *self = Self::Programs { learner, environment: alone };
+            }
+            Self::Done { .. } => unreachable!("the world model's stages come before the actor's"),
+        }
+        Ok(())
+    }
+
+    fn learner(
+        share: &Share,
+        plan: &GpuPlan<'_>,
+        (parameters, run): (&Parameters, &Run),
+        adam: &Adam,
+    ) -> Result<Box<GpuLearner>, TrainingError> {
+        let mut learner = GpuLearner::new(share, plan, parameters)?;
         learner.load(Array::Average, &run.ema_weights(parameters))?;
         learner.resume(adam)?;
-        *self = Self::Programs { learner: Box::new(learner) };
+        Ok(Box::new(learner))
+    }
+
+    /// Brings everything back from where programs run; the world model learns no more.
+    pub fn finish(&mut self, parameters: &Parameters, run: &mut Run) -> Result<(), TrainingError> {
+        if !matches!(self, Self::Tensors { .. }) {
+            *self = Self::Done { adam: self.write_back(parameters, run)? };
+        }
         Ok(())
     }
 
@@ -135,12 +194,18 @@ impl WorldUpdates {
                 let update = learner.update(&batch, &mut Sampler::numbered(seed, number))?;
                 Ok(WorldStep { losses: update.losses, gradient_norm: update.gradient_norm })
             }
-            Self::Programs { learner } => {
-                let images = Images::Stored(&batch.place);
-                let update = learner.update_world_from(&batch, images, &[], numbered_noise(seed, number))?;
+            Self::Programs { learner, environment } => {
+                let noise = numbered_noise(seed, number);
+                let update = match (*environment, batch.place.is_empty()) {
+                    (true, _) => learner.update_environment(&batch, noise)?,
+                    (false, true) => learner.update_world(&batch, noise)?,
+                    (false, false) => {
+                        learner.update_world_from(&batch, Images::Stored(&batch.place), &[], noise)?
+                    }
+                };
                 Ok(WorldStep { losses: update.losses, gradient_norm: update.gradient_norm })
             }
-            Self::Waiting { .. } => unreachable!("a run begins before it updates"),
+            Self::Waiting { .. } | Self::Done { .. } => unreachable!("a run begins before it updates"),
         }
     }
 
@@ -151,7 +216,7 @@ impl WorldUpdates {
         seed: u64,
         number: u64,
     ) -> Result<Option<LossValues>, TrainingError> {
-        let Self::Programs { learner } = self else { return Ok(None) };
+        let Self::Programs { learner, .. } = self else { return Ok(None) };
         let images = Images::Stored(&batch.place);
         Ok(Some(learner.validate_world(batch, images, numbered_noise(seed, number))?))
     }
@@ -160,8 +225,8 @@ impl WorldUpdates {
     pub fn write_back(&mut self, parameters: &Parameters, run: &mut Run) -> Result<Adam, TrainingError> {
         match self {
             Self::Tensors { learner, .. } => Ok(learner.adam().clone()),
-            Self::Waiting { adam, .. } => Ok(adam.clone()),
-            Self::Programs { learner } => {
+            Self::Waiting { adam, .. } | Self::Done { adam } => Ok(adam.clone()),
+            Self::Programs { learner, .. } => {
                 learner.write_back(Array::Values, parameters)?;
                 if let Some(average) = run.average_of(parameters)? {
                     learner.write_back(Array::Average, &average)?;
@@ -173,7 +238,7 @@ impl WorldUpdates {
 
     /// Whether the run's average must be moved after an update; programs move their own.
     pub fn leaves_average(&self) -> bool {
-        matches!(self, Self::Tensors { .. })
+        !matches!(self, Self::Programs { .. })
     }
 }
 
@@ -203,6 +268,8 @@ impl AgentUpdates {
                     model,
                     batch: (settings.replay.batch, settings.replay.length),
                     world,
+                    imitation: None,
+                    in_stages: false,
                     behaviour: Some(behaviour),
                     average_decay: 0.0,
                     stored: &[],

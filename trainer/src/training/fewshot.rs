@@ -7,6 +7,7 @@ use rcwm_models::episode::Episode;
 use rcwm_models::settings::ModelKind;
 use serde_json::json;
 
+use super::compute::{Compute, WorldUpdates};
 use super::update_loop::{Core, Outcome, Progress, Updated, Updates, make_all_updates};
 use super::{
     Best, FewshotSettings, HeldOutLosses, Phase, TimeBucket, TrainingError, TrainingSettings, start_from,
@@ -14,7 +15,7 @@ use super::{
 use crate::checkpoint::Checkpoint;
 use crate::cloning::{CloningLearner, CloningSettings};
 use crate::learning::{
-    Examples, Imitation, Side, Trained, Views, WorldLearner, cloning_loss, side_of, state_of_features,
+    Adam, Examples, Imitation, Side, Trained, Views, cloning_loss, side_of, state_of_features,
 };
 use crate::model::agent::Agent;
 use crate::model::latent::Sampler;
@@ -77,7 +78,7 @@ impl Stage {
 #[derive(Debug)]
 pub struct Fewshot {
     core: Core,
-    world: WorldLearner,
+    world: WorldUpdates,
     cloning: CloningLearner,
 }
 
@@ -87,8 +88,9 @@ impl Fewshot {
         folder: &Path,
         settings: TrainingSettings,
         source: &Checkpoint,
-        device: &Device,
+        compute: impl Into<Compute>,
     ) -> Result<Self, TrainingError> {
+        let compute = compute.into();
         if source.settings.model != settings.model {
             settings.validate()?;
             return Err(TrainingError::OtherModel);
@@ -96,30 +98,36 @@ impl Fewshot {
         let begin = |settings: &TrainingSettings, device: &Device| {
             Ok(start_from(source, &settings.reset, settings.seed, device)?)
         };
-        Self::of(Core::create(folder, settings, device.clone(), begin)?)
+        Self::of(Core::create(folder, settings, compute.device(), begin)?, compute, None)
     }
 
-    fn of(core: Core) -> Result<Self, TrainingError> {
-        let TrainingSettings { model, world, behaviour, fewshot, .. } = &core.settings;
-        let world = WorldLearner::new(&core.parameters, model, world, Trained::World)?;
+    fn of(core: Core, compute: Compute, adam: Option<Adam>) -> Result<Self, TrainingError> {
+        let TrainingSettings { model, behaviour, fewshot, .. } = &core.settings;
+        if fewshot.world_goes_on && matches!(compute, Compute::Programs(_)) {
+            return Err(TrainingError::GoesOnOnGpu);
+        }
+        let world = WorldUpdates::new(compute, &core.settings, &core.parameters, adam)?;
         let cloning = CloningLearner::new(&core.parameters, model, &fewshot.cloning, behaviour)?;
         Ok(Self { core, world, cloning })
     }
 
     /// Goes on with the run in `folder` from its newest checkpoint, or from the beginning if there is none yet.
-    pub fn resume(folder: &Path, settings: TrainingSettings, device: &Device) -> Result<Self, TrainingError> {
+    pub fn resume(
+        folder: &Path,
+        settings: TrainingSettings,
+        compute: impl Into<Compute>,
+    ) -> Result<Self, TrainingError> {
+        let compute = compute.into();
         let begin = |settings: &TrainingSettings, device: &Device| {
             let source = Checkpoint::read(&settings.from, device)?;
             Ok(start_from(&source, &settings.reset, settings.seed, device)?)
         };
-        let (core, moments) = Core::resume(folder, settings, device.clone(), &[Phase::Fewshot], begin)?;
-        let mut this = Self::of(core)?;
-        let Self { core, world, cloning } = &mut this;
-        let settings = &core.settings;
+        let (core, moments) = Core::resume(folder, settings, compute.device(), &[Phase::Fewshot], begin)?;
         let [of_world, actor, critic] = OPTIMISERS;
-        if let Some(adam) = core.adam(of_world, &settings.world.adam, &moments)? {
-            *world.adam_mut() = adam;
-        }
+        let adam = core.adam(of_world, &core.settings.world.adam, &moments)?;
+        let mut this = Self::of(core, compute, adam)?;
+        let Self { core, cloning, .. } = &mut this;
+        let settings = &core.settings;
         let actor = core.adam(actor, &settings.fewshot.cloning.actor, &moments)?;
         let critic = core.adam(critic, &settings.behaviour.critic, &moments)?;
         if let (Some(actor), Some(critic)) = (actor, critic) {
@@ -167,7 +175,7 @@ impl Fewshot {
 /// Few-shot learning under way.
 struct Running<'a> {
     core: &'a mut Core,
-    world: &'a mut WorldLearner,
+    world: &'a mut WorldUpdates,
     cloning: &'a mut CloningLearner,
     replay: Replay,
     /// The demonstrations.
@@ -191,20 +199,21 @@ impl Updates for Running<'_> {
             self.enter(stage, number)?;
         }
         self.update_in(stage, number)?;
-        Ok((stage.name(), Some(self.moved(stage))))
+        Ok((stage.name(), self.world.leaves_average().then(|| self.moved(stage))))
     }
 
     fn save(&mut self) -> Result<Option<HeldOutLosses>, TrainingError> {
+        let adam = self.world.write_back(&self.core.parameters, &mut self.core.run)?;
         let agent = self.core.agent()?;
         if !self.held_out.is_empty() {
             let cloning = self.held_out_cloning(&agent)?;
             let update = self.core.state.updates;
             self.core.run.log(&json!({"update": update, "held_out": {"cloning": cloning}}))?;
         }
-        let Self { core, world, cloning, .. } = self;
+        let Self { core, cloning, .. } = self;
         core.state.return_range = cloning.return_range();
         let [actor, critic] = cloning.adams();
-        let optimisers: Vec<_> = OPTIMISERS.into_iter().zip([world.adam(), actor, critic]).collect();
+        let optimisers: Vec<_> = OPTIMISERS.into_iter().zip([&adam, actor, critic]).collect();
         core.write(&agent, &optimisers, Best::No, 0)?;
         Ok(None)
     }
@@ -224,6 +233,9 @@ impl Running<'_> {
     /// Prepares what the stage needs from its update `number` on.
     fn enter(&mut self, stage: Stage, number: u64) -> Result<(), TrainingError> {
         self.stage = Some(stage);
+        if stage == Stage::Actor && !self.core.settings.fewshot.world_goes_on {
+            self.world.finish(&self.core.parameters, &mut self.core.run)?;
+        }
         let core = &*self.core;
         if stage == Stage::Actor && number == 0 {
             // The actor learns on the states that the deployed world model will give it.
@@ -236,9 +248,10 @@ impl Running<'_> {
             learning_rate: core.settings.world.adam.learning_rate,
         };
         let imitation = (stage != Stage::Actor && imitation.scale > 0.0).then_some(imitation);
-        self.world.train(stage.trained(core.settings.model.kind, imitation.is_some()), imitation)?;
         let seed = core.settings.seed;
         if stage != Stage::Actor || fewshot.world_goes_on {
+            let trained = stage.trained(core.settings.model.kind, imitation.is_some());
+            self.world.train(&core.settings, (&core.parameters, &core.run), trained, imitation)?;
             if self.batches.is_none() {
                 let (sizes, mut replay) = (core.settings.replay.clone(), self.replay.clone());
                 replay.look(&sizes.look);
@@ -263,20 +276,23 @@ impl Running<'_> {
 
     fn update_in(&mut self, stage: Stage, number: u64) -> Result<(), TrainingError> {
         let Self { core, world, batches, .. } = self;
-        let mut sampler = Sampler::numbered(core.settings.seed, core.state.updates);
+        let (seed, update) = (core.settings.seed, core.state.updates);
+        let mut sampler = Sampler::numbered(seed, update);
         if stage == Stage::Actor && self.examples.is_some() {
             return self.clone_from_examples(number, &mut sampler);
         }
         let batches = batches.as_mut().expect("entering a stage that draws batches starts them");
         let batch = core.interval.time(TimeBucket::WaitingForBatches, || batches.next_batch())?;
-        let batch = batch.into_tensors(&core.device)?;
-        let update = core.interval.time(TimeBucket::Learning, || world.update(&batch, &mut sampler))?;
-        let losses = json!({"losses": update.losses, "gradient_norm": update.gradient_norm});
-        if stage == Stage::Actor {
+        let told = |losses, gradient_norm| json!({"losses": losses, "gradient_norm": gradient_norm});
+        if let (Stage::Actor, WorldUpdates::Tensors { learner, .. }) = (stage, &mut **world) {
+            let batch = batch.into_tensors(&core.device)?;
+            let update = core.interval.time(TimeBucket::Learning, || learner.update(&batch, &mut sampler))?;
             let examples = Examples::of_batch(&update.posteriors.features()?, &batch)?;
+            let losses = told(update.losses, update.gradient_norm);
             return self.clone_from_batch(number, examples, losses, &mut sampler);
         }
-        core.interval.update(&losses);
+        let step = core.interval.time(TimeBucket::Learning, || world.update(batch, seed, update))?;
+        core.interval.update(&told(step.losses, step.gradient_norm));
         Ok(())
     }
 

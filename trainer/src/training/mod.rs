@@ -96,6 +96,11 @@ pub enum TrainingError {
     /// The episodes that a run is judged by could not be run.
     #[error("evaluation: {0}")]
     Evaluation(#[source] Box<crate::evaluation::ClosedLoopError>),
+    /// What programs do not do.
+    #[error(
+        "fewshot.world_goes_on: on a GPU the world model is done when the actor begins; set it to false, or leave out --device"
+    )]
+    GoesOnOnGpu,
     /// The folder holds a run.
     #[error("{path} holds a run already; say --resume, or choose another folder")]
     Exists { path: PathBuf },

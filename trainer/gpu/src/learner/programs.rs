@@ -1,5 +1,6 @@
 //! What a learner has on its machine: room for batches and results, optimisers, and the programs.
 
+use super::runs::Which;
 use super::{AdamScales, LearnerSettings};
 use crate::behaviour::{self, Sources};
 use crate::layers::Source;
@@ -12,7 +13,8 @@ use crate::world::{self, Inputs, Sizes};
 /// An optimiser's place on the machine.
 #[derive(Debug, Clone, Copy)]
 pub(super) struct Optimiser {
-    pub(super) group: Group,
+    /// The first and the last of the groups that it moves, which lie one after the other.
+    pub(super) groups: (Group, Group),
     pub(super) scales: AdamScales,
     pub(super) table: u64,
     pub(super) clip: u64,
@@ -39,11 +41,31 @@ pub(super) struct Programs {
     pub(super) world: Ready,
     pub(super) masked: Ready,
     pub(super) validation: Ready,
+    /// The environment's side, with the actor where it has a part in the loss.
+    pub(super) environment: Option<Ready>,
     pub(super) behaviour: Option<Ready>,
 }
 
 fn is_world(name: &str) -> bool {
     !(name.starts_with("actor.") || is_critic(name) || name.starts_with("slow_critic."))
+}
+
+/// What knows the scene and the task, and not the robot: as the trainer's sides have it.
+fn is_environment(name: &str) -> bool {
+    ["environment.", "interaction.", "heads.", "encoder.environment.", "decoder.environment."]
+        .iter()
+        .any(|side| name.starts_with(side))
+}
+
+/// Whether an update of the world model moves a parameter; `imitates`: and the actor.
+pub(super) fn moves(which: Which, imitates: bool) -> fn(&str) -> bool {
+    match (which, imitates) {
+        (Which::Environment, false) => is_environment,
+        (Which::Environment, true) => |name| is_environment(name) || is_actor(name),
+        (Which::World { .. }, false) => is_world,
+        (Which::World { .. }, true) => |name| is_world(name) || is_actor(name),
+        (Which::Validation | Which::Behaviour, _) => |_| false,
+    }
 }
 
 fn is_actor(name: &str) -> bool {
@@ -118,6 +140,8 @@ impl Room {
             decoded: words(rows)?,
             noise: words(10)?,
             kl: words(2 * rows)?,
+            demonstrated: words(rows * sizes.model.action)?,
+            counts: words(rows)?,
         };
         Ok(Self {
             inputs,
@@ -141,18 +165,20 @@ impl Programs {
         room: Room,
         optimisers: &[Optimiser],
     ) -> Result<Self, GpuError> {
-        let world = |masks: bool, learns: bool| {
+        let imitates = settings.imitation.is_some();
+        let world = |which: Which| {
+            let (learns, masks) = (which != Which::Validation, which == Which::World { masks: true });
             let mut tape = Tape::default();
-            let trains: fn(&str) -> bool = if learns { is_world } else { |_| false };
+            let trains = moves(which, imitates);
             // Validation is of what a checkpoint holds.
             let averaged = !learns && settings.average_decay > 0.0;
             let array = if averaged { Array::Average } else { Array::Values };
             let source = Source { weights, trains, array };
             if learns {
                 tape.program.part("optimiser");
-                tape.zero(weights.group(Array::Gradients, Group::World));
+                tape.zero(weights.groups(Array::Gradients, optimisers[0].groups));
             }
-            let parts = (settings.world, masks);
+            let parts = (settings.world, settings.imitation.filter(|_| learns), masks);
             let out = (room.features, room.scalars);
             if learns {
                 world::losses(&mut tape, source, &settings.sizes, room.inputs, parts, out);
@@ -190,10 +216,13 @@ impl Programs {
             step(&mut tape, weights, &optimisers[1..], (room.behaviour_scalars, room.taking_part), None);
             tape.program
         });
-        let programs: Vec<Program> = [world(false, true), world(true, true), world(false, false)]
-            .into_iter()
-            .chain(behaviour)
-            .collect();
+        let programs: Vec<Program> =
+            [Which::World { masks: false }, Which::World { masks: true }, Which::Validation]
+                .into_iter()
+                .chain(settings.in_stages.then_some(Which::Environment))
+                .map(world)
+                .chain(behaviour)
+                .collect();
         let layouts: Vec<_> = programs.iter().map(Program::layout).collect();
         let bytes = layouts.iter().map(|(_, bytes)| *bytes).max().unwrap_or_default();
         let arena = Arena::new(machine, bytes)?;
@@ -203,7 +232,8 @@ impl Programs {
             .map(|(program, (offsets, bytes))| machine.prepare(program.finish(&offsets, bytes, &arena)));
         let mut next = || ready.next().expect("there are as many as were built");
         let (world, masked, validation) = (next()?, next()?, next()?);
-        Ok(Self { world, masked, validation, behaviour: ready.next().transpose()? })
+        let environment = settings.in_stages.then(&mut next).transpose()?;
+        Ok(Self { world, masked, validation, environment, behaviour: ready.next().transpose()? })
     }
 }
 
@@ -219,7 +249,7 @@ fn step(
     tape.program.part("optimiser");
     let clip = |optimiser: &Optimiser| Matrix::fixed(optimiser.clip, 1, 2);
     for optimiser in optimisers {
-        let gradient = weights.group(Array::Gradients, optimiser.group);
+        let gradient = weights.groups(Array::Gradients, optimiser.groups);
         let (count, blocks) = (gradient.len(), gradient.len().div_ceil(RUN));
         let partial = tape.matrix(1, blocks);
         let grid = Grid { blocks, threads: 512, shared_bytes: 0 };
@@ -231,13 +261,13 @@ fn step(
     }
     let fixed = |address: u64| Pointer::from(Matrix::fixed(address, 1, 1));
     for optimiser in optimisers {
-        let Optimiser { group, scales, table, .. } = *optimiser;
-        let array = |array: Array| weights.group(array, group);
+        let Optimiser { groups, scales, table, .. } = *optimiser;
+        let array = |array: Array| weights.groups(array, groups);
         let count = array(Array::Values).len();
         let arrays =
             [Array::Values, Array::First, Array::Second, Array::Gradients].map(|a| Pointer::from(array(a)));
         let average = keep.map_or([Pointer::NULL; 2], |keep| [array(Array::Average).into(), fixed(keep)]);
-        let own = [clip(optimiser).into(), fixed(weights.owners(group)), fixed(table)];
+        let own = [clip(optimiser).into(), fixed(weights.owners(groups.0)), fixed(table)];
         let all = fixed(optimisers[0].clip);
         let p = [&arrays[..], &own, &average, &[all]].concat();
         let f = [scales.beta1 as f32, scales.beta2 as f32, scales.eps];

@@ -1,17 +1,18 @@
 //! The memory and programs of all runs that learn together.
 
-use super::programs::{Optimiser, Programs, Room, check};
+use super::programs::{Optimiser, Programs, Room, check, moves};
 use super::values::{Batch, BehaviourValues, Colours, Images, LearnerSettings, Noise, WorldValues};
 use crate::behaviour;
 use crate::machine::{CommandTime, GpuError, Machine, PartTime, Ready};
 use crate::program::Matrix;
 use crate::weights::{Array, Entry, Group, Weights};
-use crate::world;
+use crate::world::{self, Sizes};
 
 /// One of a learner's programs.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub(super) enum Which {
     World { masks: bool },
+    Environment,
     Validation,
     Behaviour,
 }
@@ -42,14 +43,15 @@ impl Runs {
         let weights = Weights::new(&mut machine, specs, bins, settings.sizes.model.deter)?;
         let room = Room::new(&mut machine, &settings)?;
         let mut optimisers = Vec::new();
-        let mut wanted = vec![(Group::World, settings.world_adam)];
+        let last = if settings.imitation.is_some() { Group::Actor } else { Group::World };
+        let mut wanted = vec![((Group::World, last), settings.world_adam)];
         if let Some((_, actor, critic)) = settings.behaviour {
-            wanted.extend([(Group::Actor, actor), (Group::Critic, critic)]);
+            wanted.extend([((Group::Actor, Group::Actor), actor), ((Group::Critic, Group::Critic), critic)]);
         }
         let clips = machine.allocate(8 * wanted.len())?;
-        for (at, (group, scales)) in wanted.into_iter().enumerate() {
+        for (at, (groups, scales)) in wanted.into_iter().enumerate() {
             let table = machine.allocate(8 * weights.entries().len())?;
-            optimisers.push(Optimiser { group, scales, table, clip: clips + 8 * at as u64 });
+            optimisers.push(Optimiser { groups, scales, table, clip: clips + 8 * at as u64 });
         }
         let programs = Programs::new(&mut machine, &weights, &settings, room, &optimisers)?;
         let runs = machine.runs();
@@ -115,12 +117,17 @@ impl Runs {
     pub(super) fn bring_world(
         &mut self,
         run: usize,
-        batch: &Batch<'_>,
+        (which, batch): (Which, &Batch<'_>),
         noise: Noise,
         rate: impl Fn(&str) -> f64,
     ) -> Result<(), GpuError> {
         self.bring_batch(run, batch, noise)?;
-        self.bring_rates(run, 0, rate)?;
+        let imitates = self.settings.imitation.is_some();
+        if imitates {
+            self.bring_examples(run, batch)?;
+        }
+        let moves = moves(which, imitates);
+        self.bring_rates(run, 0, |name| if moves(name) { rate(name) } else { 0.0 })?;
         let number = batch.number as f64 + 1.0;
         // The average begins as the weights after the first update.
         let keep = if number > 1.0 {
@@ -152,10 +159,16 @@ impl Runs {
         let program = match which {
             Which::World { masks: false } => Some(&self.programs.world),
             Which::World { masks: true } => Some(&self.programs.masked),
+            Which::Environment => self.programs.environment.as_ref(),
             Which::Validation => Some(&self.programs.validation),
             Which::Behaviour => self.programs.behaviour.as_ref(),
         };
-        program.map_or(Ok(()), |program| self.machine.run(program))
+        let Some(program) = program else {
+            return Err(GpuError::Unsupported(format!(
+                "this learner was made without programs for {which:?}"
+            )));
+        };
+        self.machine.run(program)
     }
 
     /// What the last update of a run's actor and critic was.
@@ -182,8 +195,9 @@ impl Runs {
             moved,
         };
         if moved {
-            self.count_step(run, 1);
-            self.count_step(run, 2);
+            for group in [Group::Actor, Group::Critic] {
+                self.count_steps(run, |entry| entry.group == group);
+            }
         }
         Ok(values)
     }
@@ -217,10 +231,9 @@ impl Runs {
         Ok(kl)
     }
 
-    fn count_step(&mut self, run: usize, which: usize) {
-        let group = self.optimisers[which].group;
+    fn count_steps(&mut self, run: usize, moved: impl Fn(&Entry) -> bool) {
         for (steps, entry) in self.steps[run].iter_mut().zip(self.weights.entries()) {
-            *steps += u64::from(entry.group == group);
+            *steps += u64::from(moved(entry));
         }
     }
 
@@ -248,7 +261,8 @@ impl Runs {
         let (rows, action) = (b * t, sizes.model.action);
         let fits = batch.action.len() == rows * action
             && [batch.reward.len(), batch.terminal.len(), batch.first.len()] == [rows; 3]
-            && (batch.shift.is_empty() || batch.shift.len() == b);
+            && (batch.shift.is_empty() || batch.shift.len() == b)
+            && (batch.examples.is_empty() || batch.examples.len() == rows);
         if !fits {
             return Err(GpuError::Unsupported(format!("the batch is not one of {b} sequences of {t} steps")));
         }
@@ -345,6 +359,28 @@ impl Runs {
         machine.upload(inputs.noise, run, &control)
     }
 
+    /// Brings what was demonstrated: in the states of examples the next step's action, all of the same weight.
+    fn bring_examples(&mut self, run: usize, batch: &Batch<'_>) -> Result<(), GpuError> {
+        let Sizes { batch: b, length: t, model, .. } = &self.settings.sizes;
+        let (rows, action) = (b * t, model.action);
+        let count = batch.examples.iter().filter(|example| **example).count().max(1);
+        let mut demonstrated = vec![0.0; rows * action];
+        let mut counts = vec![0.0; rows];
+        for row in 0..rows {
+            let from = row % b * t + row / b;
+            if row / b + 1 < *t && batch.examples.get(from) == Some(&true) {
+                counts[row] = 1.0 / count as f32;
+                let next = batch.action[(from + 1) * action..][..action].iter();
+                demonstrated[row * action..]
+                    .iter_mut()
+                    .zip(next)
+                    .for_each(|(to, x)| *to = x.clamp(-1.0, 1.0));
+            }
+        }
+        self.machine.upload(self.room.inputs.demonstrated, run, &demonstrated)?;
+        self.machine.upload(self.room.inputs.counts, run, &counts)
+    }
+
     /// What the last update of a run's world model was, or its validation.
     pub(super) fn world_values(&mut self, run: usize, which: Which) -> Result<WorldValues, GpuError> {
         let masks = which == Which::World { masks: true };
@@ -352,7 +388,7 @@ impl Runs {
         self.machine.download(address(self.room.scalars), run, &mut scalars)?;
         let mut clip = [0f32; 2];
         self.machine.download(self.optimisers[0].clip, run, &mut clip)?;
-        let [image, mask, reward, continues, first, first_floored, second, second_floored] =
+        let [image, mask, reward, continues, first, first_floored, second, second_floored, cloning] =
             scalars.map(f64::from);
         let scales = self.settings.world;
         let factor = f64::from(scales.dynamics) + f64::from(scales.representation);
@@ -366,12 +402,15 @@ impl Runs {
         if masks {
             total += f64::from(scales.mask) * mask;
         }
+        let imitation = self.settings.imitation.filter(|_| which != Which::Validation);
+        total += imitation.map_or(0.0, |imitation| f64::from(imitation.scale) * cloning);
         let robot_mask = masks.then_some(mask);
         let updated = which != Which::Validation;
         let gradient_norm = if updated { f64::from(clip[0]) } else { 0.0 };
         let moved = updated && clip[1] != 0.0;
         if moved {
-            self.count_step(run, 0);
+            let moves = moves(which, self.settings.imitation.is_some());
+            self.count_steps(run, |entry| moves(&entry.name));
         }
         Ok(WorldValues {
             image,
@@ -379,6 +418,7 @@ impl Runs {
             reward,
             continues,
             kl: [first, second],
+            cloning: imitation.map(|_| cloning),
             total,
             gradient_norm,
             moved,

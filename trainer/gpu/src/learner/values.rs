@@ -1,7 +1,7 @@
 //! What goes into an update and what comes out.
 
 use crate::behaviour::BehaviourScales;
-use crate::world::{Sizes, WorldScales};
+use crate::world::{ImitationScales, Sizes, WorldScales};
 
 /// Adam with clipping by the global norm.
 #[derive(Debug, Clone, Copy, PartialEq)]
@@ -25,8 +25,12 @@ pub struct LearnerSettings {
     pub world: WorldScales,
     /// The world model's optimiser.
     pub world_adam: AdamScales,
+    /// The actor's part in the world model's loss, whose optimiser then moves the actor, too.
+    pub imitation: Option<ImitationScales>,
     /// Actor and critic, where they learn, with their optimisers.
     pub behaviour: Option<(BehaviourScales, AdamScales, AdamScales)>,
+    /// Whether some updates are of the environment's side alone.
+    pub in_stages: bool,
     /// Decay of the running average of the world model's weights; 0: none is kept.
     pub average_decay: f64,
     /// Images that are kept on the machine, from which batches are gathered; 0: every batch brings its own.
@@ -49,6 +53,10 @@ pub struct Batch<'a> {
     pub terminal: &'a [bool],
     /// [B, T].
     pub first: &'a [bool],
+    /// Where an action was demonstrated: the state of such a step is to answer the next step's action. [B, T]; empty: nowhere.
+    pub examples: &'a [bool],
+    /// Whether the update is of the environment's side alone, and of the actor where it has a part in the loss; masks are not used then.
+    pub environment_alone: bool,
     /// Whether masks are used.
     pub masks: bool,
     /// Which batch of a run it is: what is decoded takes turns by it.
@@ -107,6 +115,8 @@ pub struct WorldValues {
     pub continues: f64,
     /// KL of each branch.
     pub kl: [f64; 2],
+    /// Distance of the actor from what was demonstrated, where it has a part in the loss.
+    pub cloning: Option<f64>,
     /// The sum with factors.
     pub total: f64,
     /// Norm of the gradients before clipping.
