@@ -1,6 +1,7 @@
 //! World model, actor and critic on one machine: weights, optimisers, and the programs that update them. Runs that learn together share the
 //! programs: each has its own learner, from a thread of its own.
 
+mod bring;
 mod meeting;
 mod programs;
 mod runs;
