@@ -7,33 +7,38 @@ use crate::machine::GpuError;
 
 /// Where the runs' threads meet.
 #[derive(Debug)]
-pub(super) struct Meeting {
+pub(super) struct Rendezvous {
     state: Mutex<State>,
     /// Something was launched, or somebody left.
-    news: Condvar,
+    changed: Condvar,
 }
 
 #[derive(Debug)]
 struct State {
     runs: Runs,
-    guests: Vec<Guest>,
+    runs_now: Vec<RunState>,
     /// What a launch failed of; nobody goes on after that.
     failed: Option<String>,
+    /// The same, for the first who asks.
+    error: Option<GpuError>,
 }
 
 /// What a run is doing.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
-enum Guest {
+enum RunState {
     /// Something else: the others wait for it.
     Busy,
     Waiting(Which),
     Gone,
 }
 
-impl Meeting {
+impl Rendezvous {
     pub(super) fn new(runs: Runs) -> Self {
-        let guests = vec![Guest::Busy; runs.machine().runs()];
-        Self { state: Mutex::new(State { runs, guests, failed: None }), news: Condvar::new() }
+        let runs_now = vec![RunState::Busy; runs.machine().runs()];
+        Self {
+            state: Mutex::new(State { runs, runs_now, failed: None, error: None }),
+            changed: Condvar::new(),
+        }
     }
 
     fn state(&self) -> MutexGuard<'_, State> {
@@ -53,51 +58,55 @@ impl Meeting {
         values: impl FnOnce(&mut Runs) -> Result<T, GpuError>,
     ) -> Result<T, GpuError> {
         let mut state = self.state();
-        state.guests[run] = Guest::Waiting(which);
+        state.runs_now[run] = RunState::Waiting(which);
         self.launch_what_is_ready(&mut state);
-        while state.guests[run] != Guest::Busy && state.failed.is_none() {
-            state = self.news.wait(state).unwrap_or_else(PoisonError::into_inner);
+        while state.runs_now[run] != RunState::Busy && state.failed.is_none() {
+            state = self.changed.wait(state).unwrap_or_else(PoisonError::into_inner);
         }
-        match &state.failed {
-            Some(reason) => {
-                Err(GpuError::Failed { what: "an update of several runs", reason: reason.clone() })
+        match (state.error.take(), &state.failed) {
+            (Some(error), _) => Err(error),
+            (None, Some(reason)) => {
+                Err(GpuError::Failed { what: "an update with other runs", reason: reason.clone() })
             }
-            None => values(&mut state.runs),
+            (None, None) => values(&mut state.runs),
         }
     }
 
     /// This run asks for nothing any more.
     pub(super) fn leave(&self, run: usize) {
         let mut state = self.state();
-        state.guests[run] = Guest::Gone;
+        state.runs_now[run] = RunState::Gone;
         self.launch_what_is_ready(&mut state);
     }
 
     /// Launches a program where nobody is busy any more.
     fn launch_what_is_ready(&self, state: &mut State) {
-        if state.failed.is_some() || state.guests.contains(&Guest::Busy) {
+        if state.failed.is_some() || state.runs_now.contains(&RunState::Busy) {
             return;
         }
-        // Behaviour first: an update of the world model writes over the states that it begins from.
-        let waiting = |guest: &Guest| match guest {
-            Guest::Waiting(which) => Some(*which),
-            Guest::Busy | Guest::Gone => None,
+        let waiting = |now: &RunState| match now {
+            RunState::Waiting(which) => Some(*which),
+            RunState::Busy | RunState::Gone => None,
         };
-        let wanted = || state.guests.iter().filter_map(waiting);
+        let wanted = || state.runs_now.iter().filter_map(waiting);
+        // Behaviour first: an update of the world model writes over the states that it begins from.
         let Some(which) = wanted().find(|which| *which == Which::Behaviour).or_else(|| wanted().next())
         else {
             return;
         };
-        let taking_part: Vec<bool> =
-            state.guests.iter().map(|guest| *guest == Guest::Waiting(which)).collect();
+        let takes_part = |now: &RunState| *now == RunState::Waiting(which);
+        let taking_part: Vec<bool> = state.runs_now.iter().map(takes_part).collect();
         match state.runs.launch(which, taking_part) {
             Ok(()) => {
-                for guest in state.guests.iter_mut().filter(|guest| **guest == Guest::Waiting(which)) {
-                    *guest = Guest::Busy;
+                for now in state.runs_now.iter_mut().filter(|now| takes_part(now)) {
+                    *now = RunState::Busy;
                 }
             }
-            Err(error) => state.failed = Some(error.to_string()),
+            Err(error) => {
+                state.failed = Some(error.to_string());
+                state.error = Some(error);
+            }
         }
-        self.news.notify_all();
+        self.changed.notify_all();
     }
 }
