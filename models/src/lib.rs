@@ -4,6 +4,7 @@
 //! | --- | --- |
 //! | [`settings`] | the sizes of a model, presets `debug`, `small`, `paper`, TOML and dotted overrides |
 //! | [`tasks`] | Meta-World's task names and their numbers on the wire |
+//! | [`interface`] | what a robot offers and a policy needs: names, units, limits, a safe action |
 //! | [`wire`] | the messages between simulator and controller and the shared-memory link that carries them |
 //! | [`bundle`] | the folder a trainer exports and a runtime deploys |
 //! | [`onnx`] | reading and writing ONNX files |
@@ -25,6 +26,7 @@ pub mod episode;
 pub mod errors;
 pub mod files;
 pub mod help;
+pub mod interface;
 pub mod lock;
 pub mod onnx;
 #[cfg(feature = "pictures")]

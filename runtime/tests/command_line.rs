@@ -97,6 +97,72 @@ fn a_library_that_is_not_onnx_runtime_is_an_error_not_a_hang() {
     assert!(error.contains("ORT_DYLIB_PATH"), "{error}");
 }
 
+/// The interface that messages of version 1 carry.
+const ROBOT: &str = include_str!("../../models/src/interface/metaworld.toml");
+
+#[test]
+fn a_robot_that_fits_a_bundle_is_said_to() {
+    let folder = tempfile::tempdir().unwrap();
+    let (robot, json) = (folder.path().join("robot.toml"), folder.path().join("check.json"));
+    std::fs::write(&robot, ROBOT).unwrap();
+    let mut command = runtime();
+    command.arg("check").arg(&robot).arg("--bundle").arg(smallest_bundle()).arg("--json").arg(&json);
+    let output = String::from_utf8(command.assert().success().get_output().stdout.clone()).unwrap();
+    assert!(output.contains("fits ") && output.contains("16576 bytes"), "{output}");
+    let report: serde_json::Value = serde_json::from_slice(&std::fs::read(&json).unwrap()).unwrap();
+    assert_eq!((&report["fits"], report["hash"].as_str().unwrap().len()), (&true.into(), 64));
+}
+
+#[test]
+fn a_robot_that_does_not_fit_a_bundle_is_told_everything_that_differs() {
+    let folder = tempfile::tempdir().unwrap();
+    let robot = folder.path().join("robot.toml");
+    for (from, to, expected) in [
+        (
+            "rate_hz = 40.0",
+            "rate_hz = 20.0",
+            "rate: the policy decides 40 times a second, the robot asks 20 times",
+        ),
+        (
+            "[64, 64, 3]",
+            "[128, 128, 3]",
+            "camera image: size: the policy needs 64 x 64 x 3, the robot has 128 x 128 x 3",
+        ),
+        ("\"delta\"", "\"velocity\"", "action hand: mode: the policy needs delta, the robot has velocity"),
+        (
+            "high = [1.0, 1.0, 1.0, 1.0]",
+            "high = [1.0, 1.0, 0.5, 1.0]",
+            "action hand: limits of z: the policy needs -1 to 1, the robot has -1 to 0.5",
+        ),
+    ] {
+        assert!(ROBOT.contains(from));
+        std::fs::write(&robot, ROBOT.replace(from, to)).unwrap();
+        let mut command = runtime();
+        command.arg("check").arg(&robot).arg("--bundle").arg(smallest_bundle());
+        let error = error_of(&mut command, 1);
+        assert!(error.contains("does not fit") && error.contains("in 1 thing;"), "{error}");
+        let output = String::from_utf8(command.assert().get_output().stdout.clone()).unwrap();
+        assert!(output.contains(expected), "{expected}\nfound {output}");
+    }
+}
+
+#[test]
+fn what_is_no_interface_is_one_line_that_names_the_place() {
+    let folder = tempfile::tempdir().unwrap();
+    let robot = folder.path().join("robot.toml");
+    for (text, expected) in [
+        (ROBOT.replace("rate_hz = 40.0", "rate_hz = 0.0"), "rate_hz = 0; expected"),
+        (format!("a = {}", "[".repeat(100_000)), "line 1"),
+        (ROBOT.replace("unit", "units"), "unknown field"),
+        ("x".repeat((1 << 20) + 1), "at most 1048576"),
+        (String::new(), "missing field `interface`"),
+    ] {
+        std::fs::write(&robot, text).unwrap();
+        let error = error_of(runtime().arg("check").arg(&robot), 1);
+        assert!(error.contains(expected) && error.contains("robot.toml"), "{error}");
+    }
+}
+
 #[test]
 fn a_run_that_nobody_talks_to_ends_with_its_own_exit_code() {
     let link = own_link();

@@ -2,6 +2,7 @@
 
 use serde::{Deserialize, Serialize};
 
+use crate::interface::ActionMode;
 use crate::settings::ModelSettings;
 use crate::{ACTION_LEN, IMAGE_CHANNELS, IMAGE_SIDE};
 
@@ -43,25 +44,6 @@ pub struct Control {
     /// What an action commands; left out, it is a displacement.
     #[serde(default, skip_serializing_if = "ActionMode::is_default")]
     pub action_mode: ActionMode,
-}
-
-/// What an action commands.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, Default, Serialize, Deserialize)]
-#[serde(rename_all = "lowercase")]
-pub enum ActionMode {
-    /// Displacements, as in Meta-World: zeros are no motion.
-    #[default]
-    Delta,
-    /// Velocities: zeros are no motion.
-    Velocity,
-    /// Positions: zeros are a pose like any other, and rest is the position that is held.
-    Absolute,
-}
-
-impl ActionMode {
-    fn is_default(&self) -> bool {
-        *self == Self::default()
-    }
 }
 
 /// Where a bundle comes from.

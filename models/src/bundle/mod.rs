@@ -17,14 +17,16 @@
 //! A bundle comes from outside: nothing in it is believed before [`Bundle::open`] has checked version, sizes, names, paths and
 //! checksums, and that no ONNX file refers to data outside itself.
 
+mod fits;
 mod graph;
 mod load;
 mod manifest;
 
+pub use crate::interface::ActionMode;
 pub use graph::GraphError;
 pub use load::{Bundle, BundleError, InitialState};
 pub use manifest::{
-    ActionMode, Control, DType, FORMAT, FileEntry, Manifest, PartEntry, PartName, Provenance, TensorSpec,
+    Control, DType, FORMAT, FileEntry, Manifest, PartEntry, PartName, Provenance, TensorSpec,
 };
 
 /// File name of the manifest.

@@ -10,6 +10,7 @@
 //! | 5 | the peer was silent for --silence-max |
 //! | 130 | ended at once by a second Ctrl-C |
 
+mod check;
 mod lab;
 mod observers;
 mod remarks;
@@ -63,6 +64,7 @@ struct Arguments {
 
 const EXAMPLES: &str = "\
 Examples:
+  rcwm-runtime check models/src/interface/metaworld.toml --bundle models/bundles/hammer
   rcwm-runtime verify --bundle models/bundles/hammer
   rcwm-runtime run --bundle models/bundles/hammer --instance demo --record runs/demo
   rcwm-runtime swap --instance demo --bundle models/bundles/hammer --now
@@ -84,6 +86,8 @@ enum Verb {
     Run(Box<run::RunArguments>),
     /// Has a run take over another bundle, without a missed tick
     Swap(swap::SwapArguments),
+    /// Says what a robot offers, and whether a bundle fits it; nothing is started
+    Check(check::CheckArguments),
     /// Checks a bundle against its golden values: every part and the whole tick
     Verify(verify::VerifyArguments),
 }
@@ -96,6 +100,7 @@ pub fn main() -> ExitCode {
     }
     crate::realtime::keep_memory();
     let result = match Arguments::parse().verb {
+        Verb::Check(arguments) => check::run(&arguments),
         Verb::Run(arguments) => run::run(&arguments),
         Verb::Swap(arguments) => swap::run(&arguments),
         Verb::Verify(arguments) => verify::run(&arguments),
