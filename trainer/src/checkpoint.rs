@@ -192,9 +192,9 @@ impl Checkpoint {
         }
         if path.is_file() {
             return match path.extension().is_some_and(|ending| ending == "pt" || ending == "pth") {
-                true => {
-                    refuse("a file of PyTorch, which is not read; expected a folder with checkpoint.toml")
-                }
+                true => refuse(
+                    "a file of PyTorch; `rcwm-trainer import --from FILE --format FORMAT --out DIR` makes a checkpoint of it",
+                ),
                 false => refuse("a file; expected a folder with checkpoint.toml, or the folder of a run"),
             };
         }

@@ -13,6 +13,7 @@
 //! | [`training`] | runs: phases, metrics, checkpoints, resuming |
 //! | [`spectrum`] | singular values and effective ranks of weights |
 //! | [`checkpoint`] | weights and settings on disk |
+//! | [`import`] | checkpoints of other implementations |
 //! | [`export`] | the bundle that a runtime deploys |
 //! | [`parity`] | our numbers against the authors' |
 //! | [`evaluation`] | what a model can do: open loop, robot dynamics, success |
@@ -28,6 +29,7 @@ pub mod cloning;
 pub mod evaluation;
 pub mod export;
 pub mod gpu;
+pub mod import;
 pub mod learning;
 pub mod model;
 pub mod ops;

@@ -7,6 +7,7 @@ mod evaluate;
 mod export;
 mod fewshot;
 mod finetune;
+mod import;
 mod init;
 mod online;
 mod parameters;
@@ -42,6 +43,7 @@ enum Verb {
     Collect(collect::Collect),
     Parameters(parameters::Parameters),
     Parity(parity::Parity),
+    Import(import::Import),
     Init(init::Init),
     Export(export::Export),
     Evaluate(Box<evaluate::Evaluate>),
@@ -59,6 +61,7 @@ impl Arguments {
             Verb::Collect(verb) => verb.run(),
             Verb::Parameters(verb) => verb.run(),
             Verb::Parity(verb) => verb.run(),
+            Verb::Import(verb) => verb.run(),
             Verb::Init(verb) => verb.run(),
             Verb::Export(verb) => verb.run(),
             Verb::Evaluate(verb) => verb.run(),
