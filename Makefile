@@ -10,6 +10,7 @@ OUT ?= runs/demo
 PRETRAINED ?= models/small
 DEMONSTRATIONS ?= 50
 DEMONSTRATOR ?= pushed
+LOOKS ?= plain
 LEARNT ?= runs/learn/$(TASK)
 BIN = $${CARGO_TARGET_DIR:-target}/release
 
@@ -26,7 +27,7 @@ demo: ## A trained policy (TASK=hammer) over shared memory: summary and films in
 learn: ## A new task (TASK=coffee-pull) from 50 demonstrations, deployed and scored: policy, film and figures in runs/learn/TASK
 	@scripts/setup demo
 	$(CARGO) build --release --locked -p rcwm-simulator -p rcwm-runtime -p rcwm-lab -p rcwm-trainer
-	@scripts/learn "$(TASK)" "$(PRETRAINED)" "$(LEARNT)" "$(DEMONSTRATIONS)" 50 "$(DEMONSTRATOR)"
+	@scripts/learn "$(TASK)" "$(PRETRAINED)" "$(LEARNT)" "$(DEMONSTRATIONS)" 50 "$(DEMONSTRATOR)" "$(LOOKS)"
 
 test: ## Everything that can be tested on one machine
 	@scripts/setup test
