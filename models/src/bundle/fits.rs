@@ -30,8 +30,8 @@ impl Control {
         found.push(differs(&place, "elements", &numbers(ACTION_LEN), &numbers(action.elements.len())));
         if action.elements.len() == ACTION_LEN {
             for (at, element) in action.elements.iter().enumerate() {
-                let needed = format!("{} to {}", self.action_low[at], self.action_high[at]);
-                let has = format!("{} to {}", action.low[at] as f32, action.high[at] as f32);
+                let needed = format!("{} to {}", self.action_low[at] + 0.0, self.action_high[at] + 0.0);
+                let has = format!("{} to {}", action.low[at] as f32 + 0.0, action.high[at] as f32 + 0.0);
                 found.push(differs(&place, &format!("limits of {element}"), &needed, &has));
             }
         }

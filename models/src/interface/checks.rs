@@ -9,7 +9,8 @@ const GROUPS_MAX: usize = 64;
 const ELEMENTS_MAX: usize = 1024;
 const SIDE_MAX: usize = 4096;
 const NAME_MAX: usize = 64;
-const RATE_HZ_MAX: f64 = 10_000.0;
+const OBSERVATION_BYTES_MAX: usize = 256 << 20;
+const RATES_HZ: std::ops::RangeInclusive<f64> = 0.001..=10_000.0;
 
 type Checked = Result<(), InterfaceError>;
 
@@ -24,9 +25,9 @@ fn invalid(place: &str, found: impl Into<String>, expected: &str) -> Checked {
 impl Interface {
     pub(super) fn check(&self) -> Checked {
         check_name("name", &self.name)?;
-        if !(self.rate_hz > 0.0 && self.rate_hz <= RATE_HZ_MAX) {
+        if !RATES_HZ.contains(&self.rate_hz) {
             let found = format!("rate_hz = {}", self.rate_hz);
-            return invalid(&self.name, found, "decisions a second, above 0 and at most 10000");
+            return invalid(&self.name, found, "decisions a second, from 0.001 to 10000");
         }
         let groups = self.state.len() + self.camera.len() + self.action.len();
         if groups > GROUPS_MAX {
@@ -46,14 +47,20 @@ impl Interface {
         check_unique("actions", self.action.iter().map(|action| &action.name))?;
         self.state.iter().try_for_each(State::check)?;
         self.camera.iter().try_for_each(Camera::check)?;
-        self.action.iter().try_for_each(|action| action.check(&self.state))
+        self.action.iter().try_for_each(|action| action.check(&self.state))?;
+        let bytes = super::Layout::of(self).observation_bytes;
+        if bytes > OBSERVATION_BYTES_MAX {
+            let expected = format!("at most {OBSERVATION_BYTES_MAX}");
+            return invalid(&self.name, format!("an observation of {bytes} bytes"), &expected);
+        }
+        Ok(())
     }
 }
 
 impl State {
     fn check(&self) -> Checked {
+        check_name("state", &self.name)?;
         let place = format!("state {}", self.name);
-        check_name(&place, &self.name)?;
         check_kind(&place, &self.kind, "state/")?;
         check_unit(&place, &self.unit)?;
         check_elements(&place, &self.elements)
@@ -62,8 +69,8 @@ impl State {
 
 impl Camera {
     fn check(&self) -> Checked {
+        check_name("camera", &self.name)?;
         let place = format!("camera {}", self.name);
-        check_name(&place, &self.name)?;
         let [rows, columns, channels] = self.shape;
         let sides = 1..=SIDE_MAX;
         if !sides.contains(&rows) || !sides.contains(&columns) || channels != 3 {
@@ -76,8 +83,8 @@ impl Camera {
 
 impl Action {
     fn check(&self, states: &[State]) -> Checked {
+        check_name("action", &self.name)?;
         let place = format!("action {}", self.name);
-        check_name(&place, &self.name)?;
         if self.kind.split('/').any(|word| word == "discrete") {
             return invalid(&place, format!("kind = {:?}", self.kind), "a continuous action");
         }
@@ -92,7 +99,7 @@ impl Action {
                 return invalid(&place, found, "low below high");
             }
         }
-        if let Some(most) = self.rate_max.filter(|most| !(most.is_finite() && *most > 0.0)) {
+        if let Some(most) = self.rate_max.filter(|most| !((*most as f32).is_finite() && *most as f32 > 0.0)) {
             let expected = "a change above 0 from one decision to the next, or none";
             return invalid(&place, format!("rate_max = {most}"), expected);
         }
@@ -163,12 +170,17 @@ impl Action {
 
     fn check_measured(&self, place: &str, states: &[State]) -> Checked {
         let Some(measured) = &self.measured else { return Ok(()) };
+        let kind = |kind: &str| kind.split_once('/').map(|(_, rest)| rest.to_owned());
         let Some(state) = states.iter().find(|state| state.name == *measured) else {
             return invalid(place, format!("measured = {measured:?}"), "the name of a state");
         };
         if state.elements != self.elements {
             let expected = "the action's own elements, in their order";
             return invalid(place, format!("measured {measured} has other elements"), expected);
+        }
+        if kind(&state.kind) != kind(&self.kind) {
+            let found = format!("measured {measured} is a {}", state.kind);
+            return invalid(place, found, &format!("the same kind as the action's {}", self.kind));
         }
         if state.unit != self.unit {
             let found = format!("measured {measured} is in {}", state.unit);
@@ -182,7 +194,7 @@ fn check_unique<'a>(of: &str, names: impl Iterator<Item = &'a String>) -> Checke
     let mut known = BTreeSet::new();
     for name in names {
         if !known.insert(name) {
-            return invalid(of, format!("{name} twice"), "every name once");
+            return invalid(of, format!("{name:?} twice"), "every name once");
         }
     }
     Ok(())

@@ -124,7 +124,7 @@ fn compare_action(found: &mut Vec<Mismatch>, action: &Action, other: &Action) {
     differs(found, &place, "unit", &action.unit, &other.unit);
     if compare_elements(found, &place, &action.elements, &other.elements) {
         for (at, element) in action.elements.iter().enumerate() {
-            let limits = |of: &Action| format!("{} to {}", of.low[at], of.high[at]);
+            let limits = |of: &Action| format!("{} to {}", of.low[at] + 0.0, of.high[at] + 0.0);
             differs(found, &place, &format!("limits of {element}"), &limits(action), &limits(other));
         }
     }

@@ -148,7 +148,10 @@ impl ActionMode {
 
 /// What is commanded when there is no decision.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
-#[serde(untagged)]
+#[serde(
+    untagged,
+    expecting = "expected fallback = \"hold\", \"hold-measured\", \"zero\" or a list of numbers"
+)]
 pub enum Fallback {
     Rule(FallbackRule),
     /// These numbers, in units.

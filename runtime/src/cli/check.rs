@@ -22,7 +22,8 @@ const BYTES_MAX: u64 = 1 << 20;
 The file says what a robot offers: its states, cameras and actions with names, units and limits
 (docs/own-robot.md). Nothing is started and nothing moves.
 
-Exits 0 if the file is sound and the bundle fits, else 1.")]
+Exits 0 if the file is sound and the bundle fits in what it says: picture, rate, mode and limits of
+the action. Bundles have no names, kinds and units yet.")]
 pub(super) struct CheckArguments {
     /// The robot's interface, robot.toml
     robot: PathBuf,
@@ -43,6 +44,8 @@ struct Report<'a> {
     action_bytes: usize,
     bundle: Option<&'a Path>,
     fits: Option<bool>,
+    /// What a bundle of this version lets be compared.
+    compared: &'static [&'static str],
     mismatches: &'a [Mismatch],
 }
 
@@ -60,13 +63,17 @@ pub(super) fn run(arguments: &CheckArguments) -> anyhow::Result<()> {
         action_bytes: layout.action_bytes,
         bundle: arguments.bundle.as_deref(),
         fits: mismatches.as_ref().map(Vec::is_empty),
+        compared: &["camera size", "rate", "action mode", "action elements", "action limits"],
         mismatches: mismatches.as_deref().unwrap_or_default(),
     };
     shared::write_json(arguments.json.as_deref(), &report)?;
     describe(&robot, &report);
     let (Some(folder), Some(found)) = (&arguments.bundle, &mismatches) else { return Ok(()) };
     if found.is_empty() {
-        rcwm_models::outln!("fits {}", folder.display());
+        rcwm_models::outln!("fits {} in sizes, rate, mode and limits", folder.display());
+        rcwm_models::outln!(
+            "names, kinds, units and states are not compared: bundles of version 1 have none"
+        );
         return Ok(());
     }
     for mismatch in found {

@@ -58,7 +58,7 @@ KERNEL(carry) {
     FOR_ALL(i, a.n[0] * a.n[1] + a.n[0] * a.n[2]) {
         int r = (int)(i / width), j = (int)(i % width), of_h = j >= a.n[1];
         if (of_h) j -= a.n[1];
-        const float *initial = (const float *)AT(1 + of_h), *carried = (const float *)AT(3 + of_h);
+        const float *initial = (const float *)AT(1 + of_h), *carried = (const float *)OR_NULL(3 + of_h);
         float *y = (float *)AT(5 + of_h);
         int begins = !carried || first[r];
         y[r * a.n[5 + of_h] + j] = begins ? initial[j] : carried[r * a.n[3 + of_h] + j];
@@ -71,7 +71,7 @@ KERNEL(carry_backward) {
     int of_z = (a.n[1] + 31) / 32, turns = of_z + (a.n[2] + 31) / 32;
     for (int turn = BLOCK; turn < turns; turn += BLOCKS) {
         int of_h = turn >= of_z, width = a.n[1 + of_h], d_stride = a.n[3 + of_h], stride = a.n[5 + of_h];
-        float *d_initial = (float *)AT(1 + of_h), *d_carried = (float *)AT(3 + of_h);
+        float *d_initial = (float *)AT(1 + of_h), *d_carried = (float *)OR_NULL(3 + of_h);
         const float *dy = (const float *)AT(5 + of_h);
         for (int lane = LANE; lane < 32; lane += LANES) {
             int j = (of_h ? turn - of_z : turn) * 32 + lane;

@@ -16,8 +16,9 @@ pub use values::{
     AdamScales, Batch, BehaviourValues, Colours, Images, LearnerSettings, Noise, Seen, WorldValues,
 };
 
+use programs::Which;
 use rendezvous::Rendezvous;
-use runs::{Runs, Which};
+use runs::Runs;
 
 /// World model, actor and critic of one run on a machine.
 #[derive(Debug)]

@@ -13,8 +13,8 @@ use rcwm_trainer::import::{Format, Imported, import};
   rcwm-trainer import --from tests/data/import/dreamerv3-torch.pt --format dreamerv3-torch \\
       --classes 8 --out runs/dreamer
 
-The sizes are read off the tensors' shapes. Every tensor is accounted for: it becomes a parameter, is
-a copy of one, or is no part of the model; anything else is refused by name.")]
+The sizes are read off the tensors' shapes. Every tensor of floating-point numbers is accounted for:
+it becomes a parameter, is a copy of one, or is no part of the model; anything else is refused.")]
 pub struct Import {
     /// The file
     #[arg(long, value_name = "FILE")]
@@ -38,6 +38,10 @@ impl Import {
         if !self.force && self.out.join(checkpoint::SETTINGS_FILE).exists() {
             return Err(CheckpointError::Exists { path: self.out }.into());
         }
+        anyhow::ensure!(
+            self.format != Format::RcwmAuthors || self.classes.is_none(),
+            "--classes: the authors' shapes tell them; leave it out"
+        );
         let Imported { parameters, settings: model, taken, copies, left } =
             import(&self.from, self.format, self.classes.unwrap_or_default())?;
         let name = self.from.file_name().unwrap_or_default().to_string_lossy().into_owned();

@@ -87,12 +87,14 @@ impl Pretrain {
         }
         let Some(first) = settings.first() else { anyhow::bail!("--seeds: expected at least one") };
         let same = |other: &TrainingSettings| {
-            (&other.data, &other.masks, other.replay.capacity_steps)
-                == (&first.data, &first.masks, first.replay.capacity_steps)
+            let of = |settings: &TrainingSettings| {
+                (settings.replay.capacity_steps, settings.replay.held_out_episodes)
+            };
+            (&other.data, &other.masks, of(other)) == (&first.data, &first.masks, of(first))
         };
         anyhow::ensure!(
             settings.iter().all(same),
-            "the runs of --seeds learn from different data; resume them one by one"
+            "the runs of --seeds learn from different data, or hold out other episodes; resume them one by one"
         );
         let computes = self.compute.computes(outs.len())?;
         let replay = load(first)?;

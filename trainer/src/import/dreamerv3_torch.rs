@@ -4,7 +4,7 @@ use rcwm_models::settings::{ModelKind, ModelSettings, Preset};
 
 use super::ImportError;
 use super::names::Layers::{Convolutions, Dense, Same};
-use super::names::{Meaning, Piece, Rule, by_rules};
+use super::names::{Meaning, Piece, Rule, by_rules, original};
 use super::pytorch::File;
 
 const RULES: &[Rule] = &[
@@ -52,8 +52,8 @@ const RULES: &[Rule] = &[
 ];
 
 pub(super) fn meaning(name: &str) -> Meaning {
-    if name.starts_with("_expl_behavior.") || name.starts_with("_task_behavior._world_model.") {
-        return Meaning::Copy;
+    if let Some(original) = original(name) {
+        return Meaning::CopyOf(original);
     }
     // The returns' running range.
     if name == "_task_behavior.ema_vals" {
@@ -81,12 +81,12 @@ pub(super) fn sizes(file: &File, classes: usize) -> Result<ModelSettings, Import
     let [_, input] = file.sides(input)?;
     let [cnn_depth, ..] = file.sides::<4>("_wm.encoder._cnn.layers.0.weight")?;
     let [bins, units] = file.sides("_wm.heads.reward.mean_layer.weight")?;
-    if classes == 0 || !latent.is_multiple_of(classes) {
+    if classes < 2 || !latent.is_multiple_of(classes) {
         return Err(ImportError::Shape {
             path: file.path().to_path_buf(),
             name: "_wm.dynamics._obs_stat_layer.weight".to_owned(),
             found: format!("of {latent} rows"),
-            expected: format!("a multiple of {classes} classes (--classes)"),
+            expected: format!("a multiple of {classes} classes, 2 or more (--classes)"),
         });
     }
     Ok(ModelSettings {

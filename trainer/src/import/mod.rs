@@ -1,10 +1,11 @@
 //! Checkpoints of other implementations: PyTorch's `latest.pt`, read without executing anything, as a checkpoint of ours.
 //!
-//! Every tensor of the file is accounted for: it becomes a parameter, is a copy of one, or is named in the list of what the implementation keeps beside
+//! Every tensor of floating-point numbers is accounted for: it becomes a parameter, is a copy of one, or is named in the list of what the implementation keeps beside
 //! its model. Anything else is refused by name, and so is a parameter that no tensor gives.
 
 mod dreamerv3_torch;
 mod names;
+mod pickle_check;
 mod pytorch;
 mod rcwm_authors;
 
@@ -37,7 +38,7 @@ pub struct Imported {
     pub taken: usize,
     /// Tensors that are copies of these under another name.
     pub copies: usize,
-    /// Tensors that are not part of the model.
+    /// Tensors of floating-point numbers that are not part of the model.
     pub left: Vec<String>,
 }
 
@@ -61,6 +62,9 @@ pub enum ImportError {
         "{path}: no tensor gives {parameter}; the file is damaged, or of another implementation than {format}"
     )]
     Missing { path: PathBuf, parameter: String, format: &'static str },
+    /// Two tensors for one parameter.
+    #[error("{path}: {name} and {other} are the same parameter; expected one of them")]
+    Twice { path: PathBuf, name: String, other: String },
     /// A tensor of another shape, type or layout than the sizes ask for.
     #[error("{path}: tensor {name} is {found}, expected {expected}")]
     Shape { path: PathBuf, name: String, found: String, expected: String },
@@ -114,9 +118,13 @@ pub fn import(path: &Path, format: Format, classes: usize) -> Result<Imported, I
     for name in file.names() {
         match format.meaning(name) {
             Meaning::Parameter(to, piece) => {
-                pieces.entry(to).or_default().insert(piece, name.clone());
+                if let Some(other) = pieces.entry(to).or_default().insert(piece, name.clone()) {
+                    let (name, path) = (name.clone(), at());
+                    return Err(ImportError::Twice { path, name, other });
+                }
             }
-            Meaning::Copy => copies += 1,
+            Meaning::CopyOf(original) if file.are_one(name, &original) => copies += 1,
+            Meaning::CopyOf(_) => left.push(name.clone()),
             Meaning::NotOfTheModel => left.push(name.clone()),
             Meaning::Unknown => {
                 return Err(ImportError::UnknownTensor {

@@ -5,8 +5,8 @@
 pub(super) enum Meaning {
     /// A parameter of ours, or a piece of one.
     Parameter(String, Piece),
-    /// The same tensor under another name.
-    Copy,
+    /// The tensor of this name once more, where it is the same one.
+    CopyOf(String),
     /// Kept beside the model.
     NotOfTheModel,
     Unknown,
@@ -22,6 +22,15 @@ pub(super) enum Piece {
     Spread,
     /// The colours of a decoder's last layer, without a mask.
     Picture,
+}
+
+/// The name of what both implementations keep under several names.
+pub(super) fn original(name: &str) -> Option<String> {
+    if let Some(rest) = name.strip_prefix("_expl_behavior.") {
+        let within = format!("_task_behavior.{rest}");
+        return Some(original(&within).unwrap_or(within));
+    }
+    name.strip_prefix("_task_behavior._world_model.").map(|rest| format!("_wm.{rest}"))
 }
 
 /// How the layers of a part are numbered.

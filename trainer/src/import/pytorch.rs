@@ -1,14 +1,16 @@
 //! Files of `torch.save`: the tensors of `agent_state_dict`, read by candle's pickle reader, which executes nothing.
 
 use std::collections::BTreeMap;
+use std::io::Read;
 use std::panic::{AssertUnwindSafe, catch_unwind};
 use std::path::{Path, PathBuf};
+use std::sync::{Mutex, PoisonError};
 
 use candle_core::pickle::{PthTensors, TensorInfo};
 use candle_core::{DType, Tensor};
 use rcwm_models::files::open_capped;
 
-use super::ImportError;
+use super::{ImportError, pickle_check};
 
 /// Largest file that is read: the paper's has about 300 MB with its optimisers.
 const BYTES_MAX: u64 = 8 << 30;
@@ -28,11 +30,18 @@ impl File {
     pub(super) fn open(path: &Path) -> Result<Self, ImportError> {
         let (_, bytes) = open_capped(path, BYTES_MAX)?;
         let refuse = |reason: String| ImportError::Unreadable { path: path.to_path_buf(), reason };
+        if let Some(reason) = pickle_of(path).and_then(|bytes| pickle_check::refused(&bytes)) {
+            return Err(refuse(reason));
+        }
         // The reader was made for files that are whole.
         let read = without_panic(|| PthTensors::new(path, Some(MODEL)));
         let tensors = read.map_err(refuse)?;
-        let plain = |name: &String| (name.replace("_orig_mod.", ""), name.clone());
-        let names: BTreeMap<_, _> = tensors.tensor_infos().keys().map(plain).collect();
+        let mut names = BTreeMap::new();
+        for name in tensors.tensor_infos().keys() {
+            if let Some(other) = names.insert(name.replace("_orig_mod.", ""), name.clone()) {
+                return Err(ImportError::Twice { path: path.to_path_buf(), name: name.clone(), other });
+            }
+        }
         if names.is_empty() {
             return Err(refuse(format!("it holds no tensors under {MODEL}")));
         }
@@ -49,6 +58,17 @@ impl File {
 
     pub(super) fn has(&self, name: &str) -> bool {
         self.names.contains_key(name)
+    }
+
+    /// Whether two names mean the same numbers of the file.
+    pub(super) fn are_one(&self, name: &str, other: &str) -> bool {
+        match (self.info(name), self.info(other)) {
+            (Ok(a), Ok(b)) => {
+                (&a.path, a.dtype, a.layout.dims()) == (&b.path, b.dtype, b.layout.dims())
+                    && a.layout.start_offset() == b.layout.start_offset()
+            }
+            _ => false,
+        }
     }
 
     fn info(&self, name: &str) -> Result<&TensorInfo, ImportError> {
@@ -77,7 +97,8 @@ impl File {
             return Err(self.wrong(name, format!("{found:?}"), format!("{shape:?}")));
         }
         if !info.layout.is_contiguous() || info.layout.start_offset() != 0 {
-            return Err(self.wrong(name, "a view of another tensor".to_owned(), "one of its own".to_owned()));
+            let expected = "one that lies in order; save it again as .contiguous()".to_owned();
+            return Err(self.wrong(name, "a view, or not contiguous".to_owned(), expected));
         }
         if !matches!(info.dtype, DType::F32 | DType::F16 | DType::BF16 | DType::F64) {
             return Err(self.wrong(name, format!("{:?}", info.dtype), "floating-point numbers".to_owned()));
@@ -106,7 +127,21 @@ impl File {
 }
 
 /// What a reader gives, or why it gave up, on one line.
+/// The description of the file's objects, where it can be had: what is wrong otherwise, the reader says.
+fn pickle_of(path: &Path) -> Option<Vec<u8>> {
+    const PICKLE_BYTES_MAX: u64 = 64 << 20;
+    let mut archive = zip::ZipArchive::new(std::fs::File::open(path).ok()?).ok()?;
+    let name = archive.file_names().find(|name| name.ends_with("data.pkl"))?.to_owned();
+    let mut bytes = Vec::new();
+    archive.by_name(&name).ok()?.take(PICKLE_BYTES_MAX).read_to_end(&mut bytes).ok()?;
+    Some(bytes)
+}
+
+/// The hook for panics is the process's: one at a time.
+static HOOK: Mutex<()> = Mutex::new(());
+
 fn without_panic<T>(read: impl FnOnce() -> candle_core::Result<T>) -> Result<T, String> {
+    let _one = HOOK.lock().unwrap_or_else(PoisonError::into_inner);
     let hook = std::panic::take_hook();
     std::panic::set_hook(Box::new(|_| {}));
     let result = catch_unwind(AssertUnwindSafe(read));

@@ -4,7 +4,7 @@ use rcwm_models::settings::{ModelKind, ModelSettings, Preset};
 
 use super::ImportError;
 use super::names::Layers::{Convolutions, Dense, Mlp, Same};
-use super::names::{Meaning, Piece, Rule, by_rules};
+use super::names::{Meaning, Piece, Rule, by_rules, original};
 use super::pytorch::File;
 
 const RULES: &[Rule] = &[
@@ -50,8 +50,8 @@ const RULES: &[Rule] = &[
 ];
 
 pub(super) fn meaning(name: &str) -> Meaning {
-    if name.starts_with("_expl_behavior.") || name.starts_with("_task_behavior._world_model.") {
-        return Meaning::Copy;
+    if let Some(original) = original(name) {
+        return Meaning::CopyOf(original);
     }
     // A head that their losses never use.
     if name.starts_with("_wm.robot_predictor.") {

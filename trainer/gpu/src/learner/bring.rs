@@ -1,7 +1,7 @@
 //! What an update needs, brought to the machine: batches, rates and noise.
 
-use super::programs::{Optimiser, Room, moves};
-use super::runs::{Runs, Which};
+use super::programs::{Optimiser, Room, Which, moves};
+use super::runs::Runs;
 use super::values::{Batch, Colours, Images, Noise};
 use crate::machine::GpuError;
 use crate::weights::Entry;

@@ -1,6 +1,5 @@
 //! What a learner has on its machine: room for batches and results, optimisers, and the programs.
 
-use super::runs::Which;
 use super::{AdamScales, LearnerSettings};
 use crate::behaviour::{self, Sources};
 use crate::layers::Source;
@@ -9,6 +8,15 @@ use crate::program::{Arena, Grid, Matrix, Pointer, Program};
 use crate::tape::Tape;
 use crate::weights::{Array, Group, Weights};
 use crate::world::{self, Inputs, Sizes};
+
+/// One of a learner's programs.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub(super) enum Which {
+    World { masks: bool },
+    Environment,
+    Validation,
+    Behaviour,
+}
 
 /// An optimiser's place on the machine.
 #[derive(Debug, Clone, Copy)]

@@ -2,7 +2,8 @@
 
 use std::sync::{Condvar, Mutex, MutexGuard, PoisonError};
 
-use super::runs::{Runs, Which};
+use super::programs::Which;
+use super::runs::Runs;
 use crate::machine::GpuError;
 
 /// Where the runs' threads meet.
@@ -17,6 +18,8 @@ pub(super) struct Rendezvous {
 struct State {
     runs: Runs,
     runs_now: Vec<RunState>,
+    /// Launches that each run took part in.
+    launches: Vec<u64>,
     /// What a launch failed of; nobody goes on after that.
     failed: Option<String>,
     /// The same, for the first who asks.
@@ -36,7 +39,13 @@ impl Rendezvous {
     pub(super) fn new(runs: Runs) -> Self {
         let runs_now = vec![RunState::Busy; runs.machine().runs()];
         Self {
-            state: Mutex::new(State { runs, runs_now, failed: None, error: None }),
+            state: Mutex::new(State {
+                launches: vec![0; runs_now.len()],
+                runs,
+                runs_now,
+                failed: None,
+                error: None,
+            }),
             changed: Condvar::new(),
         }
     }
@@ -88,18 +97,22 @@ impl Rendezvous {
             RunState::Waiting(which) => Some(*which),
             RunState::Busy | RunState::Gone => None,
         };
-        let wanted = || state.runs_now.iter().filter_map(waiting);
-        // Behaviour first: an update of the world model writes over the states that it begins from.
-        let Some(which) = wanted().find(|which| *which == Which::Behaviour).or_else(|| wanted().next())
-        else {
-            return;
+        let wanted = || {
+            state.runs_now.iter().zip(&state.launches).filter_map(|(now, made)| Some((waiting(now)?, *made)))
         };
+        // Behaviour first: an update of the world model writes over the states that it begins from. Then whoever is furthest behind, so
+        // that runs that were resumed at different updates come to ask for the same ones.
+        let behaviour = wanted().find(|(which, _)| *which == Which::Behaviour);
+        let Some((which, _)) = behaviour.or_else(|| wanted().min_by_key(|(_, made)| *made)) else { return };
         let takes_part = |now: &RunState| *now == RunState::Waiting(which);
         let taking_part: Vec<bool> = state.runs_now.iter().map(takes_part).collect();
         match state.runs.launch(which, taking_part) {
             Ok(()) => {
-                for now in state.runs_now.iter_mut().filter(|now| takes_part(now)) {
-                    *now = RunState::Busy;
+                for (now, made) in state.runs_now.iter_mut().zip(&mut state.launches) {
+                    if takes_part(now) {
+                        *now = RunState::Busy;
+                        *made += 1;
+                    }
                 }
             }
             Err(error) => {

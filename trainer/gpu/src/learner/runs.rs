@@ -1,21 +1,12 @@
 //! The memory and programs of all runs that learn together.
 
-use super::programs::{Optimiser, Programs, Room, check, moves};
+use super::programs::{Optimiser, Programs, Room, Which, check, moves};
 use super::values::{BehaviourValues, LearnerSettings, WorldValues};
 use crate::behaviour;
 use crate::machine::{CommandTime, GpuError, Machine, PartTime, Ready};
 use crate::program::Matrix;
 use crate::weights::{Array, Entry, Group, Weights};
 use crate::world;
-
-/// One of a learner's programs.
-#[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub(super) enum Which {
-    World { masks: bool },
-    Environment,
-    Validation,
-    Behaviour,
-}
 
 /// World models, actors and critics on a machine: one of each for every run.
 #[derive(Debug)]
