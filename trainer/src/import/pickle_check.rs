@@ -63,7 +63,7 @@ impl Walk {
                 | b'}' | b')' => self.push(LEAF)?,
                 b'(' => self.marks.push(self.stack.len()),
                 b't' | b'l' | b'd' => {
-                    let inner = self.to_mark()?;
+                    let inner = self.since_mark()?;
                     self.push(inner)?;
                 }
                 0x85 => self.gather(1)?,
@@ -73,7 +73,7 @@ impl Walk {
                 b'a' | b'b' => self.add(1)?,
                 b's' => self.add(2)?,
                 b'e' | b'u' => {
-                    let inner = self.to_mark()?;
+                    let inner = self.since_mark()?;
                     self.stack.push(inner);
                     self.add(1)?;
                 }
@@ -105,7 +105,7 @@ impl Walk {
     }
 
     /// The objects since the last mark, as one around them.
-    fn to_mark(&mut self) -> Result<Size, String> {
+    fn since_mark(&mut self) -> Result<Size, String> {
         let mark = self.marks.pop().filter(|mark| *mark <= self.stack.len());
         let mark = mark.ok_or_else(|| "its structure is damaged".to_owned())?;
         Ok(self.stack.drain(mark..).fold(LEAF, around))
