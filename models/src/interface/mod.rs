@@ -181,12 +181,16 @@ pub enum InterfaceError {
 
 /// The file around an interface.
 #[derive(Debug, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
 struct File {
     interface: Interface,
+    /// Of bundles alone: which of these a policy reads.
+    #[serde(default, skip_serializing, rename = "policy")]
+    _policy: Option<toml::Table>,
 }
 
 impl Interface {
-    /// Reads and checks the text of a `robot.toml`. Other tables beside `[interface]` are left to whoever knows them.
+    /// Reads and checks the text of a `robot.toml`. Beside `[interface]` it may have a bundle's `[policy]`, which is not read.
     ///
     /// # Errors
     /// [`InterfaceError`], which names the place.
@@ -196,7 +200,7 @@ impl Interface {
             let place = line.map_or_else(String::new, |line| format!("line {line}: "));
             InterfaceError::Syntax(format!("{place}{}", error.message()))
         };
-        let File { interface } = toml::from_str(text).map_err(syntax)?;
+        let File { interface, .. } = toml::from_str(text).map_err(syntax)?;
         interface.check()?;
         Ok(interface)
     }

@@ -239,12 +239,13 @@ impl Machine {
 
     /// Makes a program ready; on a GPU it is captured, so that its first run costs what every run does.
     pub fn prepare(&mut self, finished: Finished) -> Result<Ready, GpuError> {
-        let runs = Runs { count: self.runs, apart: &self.apart };
         Ok(Ready {
             #[cfg(feature = "cuda")]
             graph: match &mut self.place {
                 Place::Host(_) => None,
-                Place::Nvidia(gpu) => gpu.capture(&finished, runs)?,
+                Place::Nvidia(gpu) => {
+                    gpu.capture(&finished, Runs { count: self.runs, apart: &self.apart })?
+                }
             },
             finished,
         })
@@ -273,11 +274,12 @@ impl Machine {
 
     /// How long each kind of command of a program takes by itself, the dearest first; nothing on the host.
     pub fn time_commands(&mut self, program: &Ready) -> Result<Vec<CommandTime>, GpuError> {
-        let runs = Runs { count: self.runs, apart: &self.apart };
         match &mut self.place {
             Place::Host(_) => Ok(Vec::new()),
             #[cfg(feature = "cuda")]
-            Place::Nvidia(gpu) => gpu.time_commands(&program.finished, runs),
+            Place::Nvidia(gpu) => {
+                gpu.time_commands(&program.finished, Runs { count: self.runs, apart: &self.apart })
+            }
         }
     }
 }

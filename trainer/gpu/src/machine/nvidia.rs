@@ -63,7 +63,7 @@ impl std::fmt::Debug for Graph {
     }
 }
 
-// SAFETY: a graph belongs to one learner, which uses it from one thread at a time.
+// SAFETY: the runs that share a graph launch it one at a time, behind a lock.
 unsafe impl Send for Graph {}
 
 /// The kernels as one source: the header once, and no includes.
