@@ -12,7 +12,7 @@ use crate::files::{FileError, read_capped, sha256_hex};
 use crate::onnx::{self, OnnxError};
 use crate::settings::{ModelKind, SettingsError};
 use crate::tensors::{Tensors, TensorsError};
-use crate::wire::ACTION_MAX;
+
 
 /// Largest file of initial states accepted, in bytes.
 const INITIAL_BYTES_MAX: u64 = 1 << 20;
@@ -198,7 +198,7 @@ impl Manifest {
         }
         for (low, high) in control.action_low.iter().zip(&control.action_high) {
             // Written so that NaN fails.
-            if !(*low >= -ACTION_MAX && *high <= ACTION_MAX && low < high) {
+            if !(*low >= -1.0 && *high <= 1.0 && low < high) {
                 return Err(BundleError::Invalid(format!(
                     "control: action limits {low} to {high}, expected low < high, both in [-1, 1] as on the wire; scale the \
                      policy's actions to that and export it again"

@@ -18,12 +18,13 @@ mod npy;
 mod npz;
 
 use std::path::{Path, PathBuf};
+use std::sync::Arc;
 
 use ndarray::{Array1, Array2, Array3, Array4, Axis, Slice};
 
 use crate::files::{FileError, read_capped, write_atomic, write_new};
-use crate::wire::{Observation, ObservationFlags};
-use crate::{ACTION_LEN, IMAGE_CHANNELS, IMAGE_SIDE, PROPRIOCEPTION_LEN};
+use crate::wire::{Format, Observation, ObservationFlags};
+use crate::{ACTION_LEN, IMAGE_CHANNELS, IMAGE_SIDE};
 
 /// Longest episode accepted, in steps.
 pub const STEPS_MAX: usize = 100_000;
@@ -201,6 +202,8 @@ pub fn robot_above(largest: f64) -> f64 {
 /// Collects observations into an [`Episode`].
 #[derive(Debug, Default)]
 pub struct EpisodeBuilder {
+    /// Of the first observation, and so of all.
+    format: Option<Arc<Format>>,
     image: Vec<u8>,
     action: Vec<f32>,
     reward: Vec<f32>,
@@ -249,19 +252,28 @@ impl EpisodeBuilder {
         if self.len() == STEPS_MAX {
             return refuse("the episode is too long");
         }
+        if observation.format().interface().camera.is_empty() {
+            return refuse("the robot has no camera");
+        }
         if !observation.is_finite() {
             return refuse("a number is not finite");
         }
         if !observation.has_executable_action() {
-            return refuse("the executed action is out of [-1, 1]");
+            return refuse("the executed action is out of its limits");
         }
-        self.image.extend_from_slice(&observation.image);
-        self.action.extend_from_slice(&observation.executed_action);
+        let format = self.format.get_or_insert_with(|| Arc::clone(observation.format()));
+        if format != observation.format() {
+            return refuse("it is of another interface than those before it");
+        }
+        self.image.extend_from_slice(observation.image(0));
+        self.action.extend_from_slice(observation.executed());
         self.reward.push(observation.reward);
         self.flags.push(flags);
-        self.robot_mask.extend(observation.robot_mask.iter().map(|pixel| *pixel > 127));
-        self.masks += usize::from(flags.contains(ObservationFlags::MASK_VALID));
-        self.proprio.extend_from_slice(&observation.proprioception);
+        if let Some(mask) = observation.mask(0) {
+            self.robot_mask.extend(mask.iter().map(|pixel| *pixel > 127));
+            self.masks += 1;
+        }
+        self.proprio.extend_from_slice(observation.state());
         Ok(())
     }
 
@@ -270,14 +282,13 @@ impl EpisodeBuilder {
     pub fn finish(&mut self) -> Option<Episode> {
         let this = std::mem::take(self);
         let steps = this.len();
-        if steps == 0 {
-            return None;
-        }
+        let format = this.format?;
+        let [rows, columns, channels] = format.interface().camera[0].shape;
         let bits = |flag| this.flags.iter().map(|flags| flags.contains(flag)).collect::<Array1<bool>>();
         let mut is_first = bits(ObservationFlags::FIRST);
         is_first[0] = true;
         let fits = "pushed in whole steps";
-        let mut action = Array2::from_shape_vec((steps, ACTION_LEN), this.action).expect(fits);
+        let mut action = Array2::from_shape_vec((steps, format.action_numbers()), this.action).expect(fits);
         // No action led to the first step of what was seen, also where it was joined in its middle.
         action.row_mut(0).fill(0.0);
         Some(Episode {
@@ -286,14 +297,16 @@ impl EpisodeBuilder {
             success: bits(ObservationFlags::SUCCESS),
             pushed: bits(ObservationFlags::PUSHED),
             is_first,
-            image: Array4::from_shape_vec((steps, IMAGE_SIDE, IMAGE_SIDE, IMAGE_CHANNELS), this.image)
-                .expect(fits),
+            image: Array4::from_shape_vec((steps, rows, columns, channels), this.image).expect(fits),
             action,
             reward: this.reward.into(),
             robot_mask: (this.masks == steps).then(|| {
-                Array3::from_shape_vec((steps, IMAGE_SIDE, IMAGE_SIDE), this.robot_mask).expect(fits)
+                Array3::from_shape_vec((steps, rows, columns), this.robot_mask).expect(fits)
             }),
-            proprio: Some(Array2::from_shape_vec((steps, PROPRIOCEPTION_LEN), this.proprio).expect(fits)),
+            proprio: Some(
+                Array2::from_shape_vec((steps, format.interface().state_numbers()), this.proprio)
+                    .expect(fits),
+            ),
             disturbed: None,
         })
     }

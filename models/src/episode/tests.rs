@@ -1,7 +1,9 @@
 use super::*;
+use crate::wire::Format;
 
 fn observation(step: u32, last: bool, mask: bool) -> Observation {
-    let mut observation = Observation::zeroed();
+    let mut whole = Observation::zeroed(&Format::metaworld());
+    let mut observation = whole.edit();
     observation.step = step;
     observation.flags = ObservationFlags::default()
         .with(ObservationFlags::FIRST, step == 0)
@@ -9,11 +11,11 @@ fn observation(step: u32, last: bool, mask: bool) -> Observation {
         .with(ObservationFlags::MASK_VALID, mask)
         .0;
     observation.reward = step as f32;
-    observation.image[step as usize] = 200;
-    observation.robot_mask[step as usize] = 255;
-    observation.executed_action[1] = -0.25;
-    observation.proprioception[17] = 0.5;
-    observation
+    observation.image(0)[step as usize] = 200;
+    observation.mask(0).unwrap()[step as usize] = 255;
+    observation.executed()[1] = -0.25;
+    observation.state()[17] = 0.5;
+    whole
 }
 
 #[test]

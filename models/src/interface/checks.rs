@@ -10,6 +10,10 @@ const ELEMENTS_MAX: usize = 1024;
 const SIDE_MAX: usize = 4096;
 const NAME_MAX: usize = 64;
 const OBSERVATION_BYTES_MAX: usize = 256 << 20;
+/// Most numbers that all actions have together.
+pub const ACTION_NUMBERS_MAX: usize = 64;
+/// Most cameras.
+pub const CAMERAS_MAX: usize = 8;
 const RATES_HZ: std::ops::RangeInclusive<f64> = 0.001..=10_000.0;
 
 type Checked = Result<(), InterfaceError>;
@@ -33,6 +37,15 @@ impl Interface {
         if groups > GROUPS_MAX {
             let expected = format!("at most {GROUPS_MAX}");
             return invalid(&self.name, format!("{groups} states, cameras and actions"), &expected);
+        }
+        if self.camera.len() > CAMERAS_MAX {
+            let expected = format!("at most {CAMERAS_MAX}");
+            return invalid(&self.name, format!("{} cameras", self.camera.len()), &expected);
+        }
+        let numbers = self.action_numbers();
+        if numbers > ACTION_NUMBERS_MAX {
+            let expected = format!("at most {ACTION_NUMBERS_MAX}");
+            return invalid(&self.name, format!("{numbers} numbers of all actions together"), &expected);
         }
         if self.action.is_empty() {
             return invalid(

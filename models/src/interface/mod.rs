@@ -42,6 +42,7 @@ mod tests;
 
 use serde::{Deserialize, Serialize};
 
+pub use checks::{ACTION_NUMBERS_MAX, CAMERAS_MAX};
 pub use compare::{Mismatch, mismatches};
 pub use layout::{Block, Layout};
 pub use normalise::{Normaliser, NotFinite};

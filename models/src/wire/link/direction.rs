@@ -1,6 +1,7 @@
-//! One direction of the link: a publish-subscribe service and the event service that wakes its receiver.
+//! One direction of the link: a publish-subscribe service of headers and bytes, and the event service that wakes its receiver.
 
 use std::cell::Cell;
+use std::mem::MaybeUninit;
 use std::os::fd::BorrowedFd;
 use std::time::{Duration, Instant};
 
@@ -9,7 +10,9 @@ use iceoryx2::port::notifier::Notifier;
 use iceoryx2::port::publisher::Publisher;
 use iceoryx2::port::subscriber::Subscriber;
 use iceoryx2::prelude::*;
+use iceoryx2::service::attribute::{AttributeKey, AttributeValue};
 use iceoryx2::sample::Sample;
+use iceoryx2::sample_mut::SampleMut;
 use iceoryx2::service::builder::event::EventOpenOrCreateError;
 use iceoryx2::service::builder::publish_subscribe::PublishSubscribeOpenOrCreateError;
 use iceoryx2::service::port_factory::{event, publish_subscribe};
@@ -17,88 +20,137 @@ use rustix::event::{PollFd, PollFlags, Timespec, poll};
 
 use super::error::traffic;
 use super::{Events, Ipc, LinkError, Wait};
+use crate::wire::WIRE;
 
 /// A message in shared memory; it stays valid while this is held.
-pub(super) type Received<T> = Sample<Ipc, T, ()>;
+pub(super) type Received<H> = Sample<Ipc, [u8], H>;
+/// Room in shared memory for a message.
+pub(super) type Loan<H> = SampleMut<Ipc, [u8], H>;
 
 /// Recorders and other listeners beside the controller.
 const SUBSCRIBERS_MAX: usize = 8;
 const NODES_MAX: usize = 16;
 const EVENT_ID_MAX: usize = 7;
+/// Blocks of a message are aligned to as much from its beginning.
+const PAYLOAD_ALIGNMENT: Alignment = Alignment::ALIGN_64;
 
 pub(super) const EVENT_PUBLISHED: usize = 0;
 pub(super) const EVENT_HELLO: usize = 1;
 pub(super) const EVENT_CLOSED: usize = 2;
+/// Somebody asks for the interface.
+pub(super) const EVENT_ASKED: usize = 3;
+
+/// What a message begins with; `()` for none.
+pub(super) trait Header: ZeroCopySend + std::fmt::Debug + Default + 'static {}
+impl<H: ZeroCopySend + std::fmt::Debug + Default + 'static> Header for H {}
+
+/// What both ends of a service must agree on.
+pub(super) struct Topic<'a> {
+    pub(super) instance: &'a str,
+    /// `observation`, `action` or `interface`.
+    pub(super) name: &'a str,
+    /// The interface by which messages are laid out; none where they are of no interface.
+    pub(super) interface_hash: Option<&'a str>,
+    /// Whether who comes later gets the last message.
+    pub(super) history: bool,
+}
 
 /// Both services of one direction.
-pub(super) struct Direction<T: ZeroCopySend + std::fmt::Debug + 'static> {
+pub(super) struct Direction<H: Header> {
     name: String,
-    data: publish_subscribe::PortFactory<Ipc, T, ()>,
+    data: publish_subscribe::PortFactory<Ipc, [u8], H>,
     event: event::PortFactory<Ipc>,
 }
 
-impl<T: ZeroCopySend + std::fmt::Debug + 'static> Direction<T> {
-    pub(super) fn open(node: &Node<Ipc>, instance: &str, topic: &str) -> Result<Self, LinkError> {
-        let name = format!("rcwm/{instance}/{topic}");
-        let service: ServiceName =
-            name.as_str().try_into().map_err(|_| LinkError::InstanceName(instance.to_owned()))?;
+/// The event service of a direction, which is of no interface.
+pub(super) fn open_event(
+    node: &Node<Ipc>,
+    instance: &str,
+    topic: &str,
+) -> Result<event::PortFactory<Ipc>, LinkError> {
+    let (name, service) = service_name(instance, topic)?;
+    node.service_builder(&service)
+        .event()
+        .max_notifiers(SUBSCRIBERS_MAX)
+        .max_listeners(SUBSCRIBERS_MAX)
+        .max_nodes(NODES_MAX)
+        .event_id_max_value(EVENT_ID_MAX)
+        .open_or_create()
+        .map_err(|error: EventOpenOrCreateError| LinkError::Service {
+            service: name,
+            reason: format!("{error:?}"),
+        })
+}
+
+pub(super) fn make_waker(event: &event::PortFactory<Ipc>) -> Result<Waker, LinkError> {
+    let service = event.name().to_string();
+    let created = event.notifier_builder().create();
+    created.map(Waker).map_err(|error| LinkError::Service { service, reason: format!("{error:?}") })
+}
+
+fn service_name(instance: &str, topic: &str) -> Result<(String, ServiceName), LinkError> {
+    let name = format!("rcwm/{instance}/{topic}");
+    let service = name.as_str().try_into().map_err(|_| LinkError::InstanceName(instance.to_owned()))?;
+    Ok((name, service))
+}
+
+impl<H: Header> Direction<H> {
+    pub(super) fn open(node: &Node<Ipc>, topic: &Topic<'_>) -> Result<Self, LinkError> {
+        let (name, service) = service_name(topic.instance, topic.name)?;
         let data = node
             .service_builder(&service)
-            .publish_subscribe::<T>()
-            .history_size(0)
+            .publish_subscribe::<[u8]>()
+            .user_header::<H>()
+            .payload_alignment(PAYLOAD_ALIGNMENT)
+            .history_size(usize::from(topic.history))
             .subscriber_max_buffer_size(1)
             .subscriber_max_borrowed_samples(2)
             .enable_safe_overflow(true)
             .max_publishers(1)
             .max_subscribers(SUBSCRIBERS_MAX)
             .max_nodes(NODES_MAX)
-            .open_or_create()
+            .open_or_create_with_attributes(&attributes(topic)?)
             .map_err(|error| Self::data_error(&name, error))?;
-        let event = node
-            .service_builder(&service)
-            .event()
-            .max_notifiers(SUBSCRIBERS_MAX)
-            .max_listeners(SUBSCRIBERS_MAX)
-            .max_nodes(NODES_MAX)
-            .event_id_max_value(EVENT_ID_MAX)
-            .open_or_create()
-            .map_err(|error: EventOpenOrCreateError| LinkError::Service {
-                service: name.clone(),
-                reason: format!("{error:?}"),
-            })?;
+        let event = open_event(node, topic.instance, topic.name)?;
         Ok(Self { name, data, event })
     }
 
     fn data_error(name: &str, error: PublishSubscribeOpenOrCreateError) -> LinkError {
-        use iceoryx2::service::builder::publish_subscribe::PublishSubscribeOpenError::IncompatibleTypes;
+        use iceoryx2::service::builder::publish_subscribe::PublishSubscribeOpenError::{
+            IncompatibleAttributes, IncompatibleTypes,
+        };
+        let service = name.to_owned();
         match error {
             PublishSubscribeOpenOrCreateError::PublishSubscribeOpenError(IncompatibleTypes) => {
                 // SAFETY: the name is a constant; the function is marked unsafe because peers trust it.
-                let expected = unsafe { <T as ZeroCopySend>::type_name() };
-                LinkError::OtherVersion { service: name.to_owned(), expected }
+                let expected = unsafe { <H as ZeroCopySend>::type_name() };
+                LinkError::OtherVersion { service, expected }
             }
-            other => LinkError::Service { service: name.to_owned(), reason: format!("{other:?}") },
+            PublishSubscribeOpenOrCreateError::PublishSubscribeOpenError(IncompatibleAttributes) => {
+                LinkError::OtherInterface { service }
+            }
+            other => LinkError::Service { service, reason: format!("{other:?}") },
         }
     }
 
-    pub(super) fn sender(&self, role: &'static str) -> Result<Sender<T>, LinkError> {
+    /// A sender of messages of at most so many bytes.
+    pub(super) fn sender(&self, role: &'static str, bytes_max: usize) -> Result<Sender<H>, LinkError> {
         use iceoryx2::port::publisher::PublisherCreateError::ExceedsMaxSupportedPublishers;
-        let publisher =
-            self.data.publisher_builder().max_loaned_samples(1).create().map_err(|error| match error {
+        let publisher = self
+            .data
+            .publisher_builder()
+            .max_loaned_samples(1)
+            .initial_max_slice_len(bytes_max)
+            .allocation_strategy(AllocationStrategy::Static)
+            .create()
+            .map_err(|error| match error {
                 ExceedsMaxSupportedPublishers => LinkError::Taken { service: self.name.clone(), role },
                 other => LinkError::Service { service: self.name.clone(), reason: format!("{other:?}") },
             })?;
-        Ok(Sender { publisher, waker: self.waker()? })
+        Ok(Sender { publisher, waker: make_waker(&self.event)? })
     }
 
-    pub(super) fn waker(&self) -> Result<Waker, LinkError> {
-        let created = self.event.notifier_builder().create();
-        created
-            .map(Waker)
-            .map_err(|error| LinkError::Service { service: self.name.clone(), reason: format!("{error:?}") })
-    }
-
-    pub(super) fn receiver(&self) -> Result<Receiver<T>, LinkError> {
+    pub(super) fn receiver(&self) -> Result<Receiver<H>, LinkError> {
         let failed = |reason: String| LinkError::Service { service: self.name.clone(), reason };
         let subscriber =
             self.data.subscriber_builder().create().map_err(|error| failed(format!("{error:?}")))?;
@@ -108,14 +160,43 @@ impl<T: ZeroCopySend + std::fmt::Debug + 'static> Direction<T> {
     }
 }
 
-pub(super) struct Sender<T: ZeroCopySend + std::fmt::Debug + 'static> {
-    pub(super) publisher: Publisher<Ipc, T, ()>,
+fn attributes(topic: &Topic<'_>) -> Result<AttributeVerifier, LinkError> {
+    let wrong = |error: String| LinkError::Service { service: topic.name.to_owned(), reason: error };
+    let wire = WIRE.to_string();
+    let named = [("rcwm.wire", Some(wire.as_str())), ("rcwm.interface", topic.interface_hash)];
+    let mut all = AttributeVerifier::new();
+    for (key, value) in named {
+        let Some(value) = value else { continue };
+        let key = AttributeKey::try_from(key).map_err(|error| wrong(format!("{error:?}")))?;
+        let value = AttributeValue::try_from(value).map_err(|error| wrong(format!("{error:?}")))?;
+        all = all.require(&key, &value).map_err(|error| wrong(format!("{error:?}")))?;
+    }
+    Ok(all)
+}
+
+pub(super) struct Sender<H: Header> {
+    publisher: Publisher<Ipc, [u8], H>,
     waker: Waker,
 }
 
-impl<T: ZeroCopySend + std::fmt::Debug + 'static> Sender<T> {
+impl<H: Header> Sender<H> {
     pub(super) fn notify(&self, event: usize) -> Result<(), LinkError> {
         self.waker.notify(event)
+    }
+
+    /// A place for a message of so many bytes, which are zeros.
+    pub(super) fn loan(&self, bytes: usize) -> Result<Loan<H>, LinkError> {
+        let mut sample = self.publisher.loan_slice_uninit(bytes).map_err(traffic("loaning a message"))?;
+        sample.payload_mut().fill(MaybeUninit::new(0));
+        *sample.user_header_mut() = H::default();
+        // SAFETY: every byte and the header were written above.
+        Ok(unsafe { sample.assume_init() })
+    }
+
+    /// Sends a message and wakes who waits for it.
+    pub(super) fn send(&self, message: Loan<H>) -> Result<(), LinkError> {
+        message.send().map_err(traffic("publishing a message"))?;
+        self.notify(EVENT_PUBLISHED)
     }
 }
 
@@ -129,15 +210,15 @@ impl Waker {
     }
 }
 
-pub(super) struct Receiver<T: ZeroCopySend + std::fmt::Debug + 'static> {
-    subscriber: Subscriber<Ipc, T, ()>,
+pub(super) struct Receiver<H: Header> {
+    subscriber: Subscriber<Ipc, [u8], H>,
     listener: Listener<Ipc>,
     /// Signals that came with a message and were not yet acted upon.
     pending: Cell<Events>,
 }
 
-impl<T: ZeroCopySend + std::fmt::Debug + 'static> Receiver<T> {
-    pub(super) fn poll(&self) -> Result<Option<Received<T>>, LinkError> {
+impl<H: Header> Receiver<H> {
+    pub(super) fn poll(&self) -> Result<Option<Received<H>>, LinkError> {
         self.subscriber.receive().map_err(traffic("receiving"))
     }
 
@@ -153,7 +234,7 @@ impl<T: ZeroCopySend + std::fmt::Debug + 'static> Receiver<T> {
         &self,
         spin: Duration,
         timeout: Duration,
-    ) -> Result<(Wait<Received<T>>, Events), LinkError> {
+    ) -> Result<(Wait<Received<H>>, Events), LinkError> {
         let start = Instant::now();
         while start.elapsed() < spin.min(timeout) {
             if let Some(sample) = self.poll()? {
@@ -169,7 +250,7 @@ impl<T: ZeroCopySend + std::fmt::Debug + 'static> Receiver<T> {
                 return Ok((Wait::Closed, self.pending.take()));
             }
             let left = timeout.saturating_sub(start.elapsed());
-            if left.is_zero() || self.pending.get().hello {
+            if left.is_zero() || self.pending.get().hello || self.pending.get().asked {
                 return Ok((Wait::TimedOut, self.pending.take()));
             }
             if self.sleep(left)? == Woken::BySignal {
@@ -224,6 +305,7 @@ impl Events {
         match id.as_value() {
             EVENT_HELLO => self.hello = true,
             EVENT_CLOSED => self.closed = true,
+            EVENT_ASKED => self.asked = true,
             _ => {}
         }
     }

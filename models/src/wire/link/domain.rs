@@ -13,19 +13,29 @@ pub(super) fn join<T>(
     message_bytes: usize,
     open: impl FnOnce(Node<Ipc>) -> Result<T, LinkError>,
 ) -> Result<T, LinkError> {
+    let root = config(settings.prefix.as_deref())?.global.root_path().to_string();
+    memory::open_folders(Path::new(&root));
+    reserve_new(settings, message_bytes, || make_node(settings).and_then(open))
+}
+
+/// Makes ports, whose messages are of so many bytes, and takes the room in shared memory that they need for good.
+pub(super) fn reserve_new<T>(
+    settings: &LinkSettings,
+    message_bytes: usize,
+    open: impl FnOnce() -> Result<T, LinkError>,
+) -> Result<T, LinkError> {
     let config = config(settings.prefix.as_deref())?;
     let (prefix, root) = (config.global.prefix.to_string(), config.global.root_path().to_string());
     memory::check_room(message_bytes)?;
-    memory::open_folders(Path::new(&root));
     let before = memory::files(&prefix);
-    let link = make_node(settings).and_then(open).map_err(|error| match error {
+    let made = open().map_err(|error| match error {
         LinkError::Node(_) | LinkError::Service { .. } => {
             memory::other_user(Path::new(&root), &prefix).unwrap_or(error)
         }
         other => other,
     })?;
     memory::reserve(&prefix, &before)?;
-    Ok(link)
+    Ok(made)
 }
 
 /// Joins the domain as a node of its own.

@@ -2,6 +2,8 @@
 
 use std::path::PathBuf;
 
+use crate::interface::{InterfaceError, Mismatch};
+
 /// Why a link could not be made or used.
 #[derive(Debug, thiserror::Error)]
 pub enum LinkError {
@@ -56,6 +58,28 @@ pub enum LinkError {
         /// The type name this program speaks.
         expected: &'static str,
     },
+    /// A peer that is connected speaks for another interface.
+    #[error(
+        "{service}: a program that is still connected uses another interface; end it first, or choose another --instance"
+    )]
+    OtherInterface {
+        /// The service's name.
+        service: String,
+    },
+    /// The robot is not what the controller needs.
+    #[error("instance {instance}: robot {robot} does not fit: {}", mismatches.iter().map(ToString::to_string).collect::<Vec<_>>().join("; "))]
+    DoesNotFit {
+        instance: String,
+        /// Its name.
+        robot: String,
+        mismatches: Vec<Mismatch>,
+    },
+    /// What a robot says of itself is no interface.
+    #[error("instance {instance}: the robot's {source}")]
+    NoInterface { instance: String, source: InterfaceError },
+    /// A message of another length than the interface gives it.
+    #[error("{service}: a message of {found} bytes, expected {expected}; the peer does not keep to the interface")]
+    MessageLength { service: &'static str, found: usize, expected: usize },
     /// The place is taken.
     #[error("{service}: another {role} is already connected; stop it or choose another --instance")]
     Taken {

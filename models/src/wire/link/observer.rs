@@ -1,55 +1,134 @@
 //! Listening in: a recorder's or a monitor's end, beside the controller.
 
-use std::time::Duration;
+use std::cell::OnceCell;
+use std::sync::Arc;
+use std::time::{Duration, Instant};
 
 use iceoryx2::prelude::Node;
 
-use super::direction::{Direction, Received, Receiver};
+use super::announce::Inquirer;
+use super::direction::{Direction, Received, Receiver, Topic};
 use super::domain::join;
 use super::{Ipc, LinkError, LinkSettings, Wait};
-use crate::wire::{Action, Observation};
+use crate::interface::Interface;
+use crate::wire::{Action, ActionHeader, ActionValues, Format, Observation, ObservationHeader};
 
-/// Receives observations without taking part: nobody waits for it, and it sees the newest only.
-pub struct ObserverLink {
-    settings: LinkSettings,
-    observations: Receiver<Observation>,
-    // Dropped last: the port above belongs to it.
-    _node: Node<Ipc>,
+/// How often a robot that is not there yet, or did not listen, is asked again.
+const ASK_EVERY: Duration = Duration::from_millis(250);
+
+/// Asks until the robot has said its interface or the time is up.
+pub(super) fn await_robot(inquirer: &Inquirer, timeout: Duration) -> Result<Option<Interface>, LinkError> {
+    let start = Instant::now();
+    loop {
+        let left = timeout.saturating_sub(start.elapsed());
+        if let Some(interface) = inquirer.wait(left.min(ASK_EVERY))? {
+            return Ok(Some(interface));
+        }
+        if start.elapsed() >= timeout {
+            return Ok(None);
+        }
+        inquirer.ask()?;
+    }
 }
 
-impl ObserverLink {
-    /// Opens or creates the observation service of an instance.
-    pub fn open(settings: LinkSettings) -> Result<Self, LinkError> {
+pub(super) fn observation_of(
+    sample: Received<ObservationHeader>,
+    format: &Arc<Format>,
+) -> Result<Observation, LinkError> {
+    let expected = format.layout().observation_bytes;
+    let wrong = |found| LinkError::MessageLength { service: "observation", found, expected };
+    Observation::of_sample(sample, format).map_err(wrong)
+}
+
+pub(super) fn action_of(sample: &Received<ActionHeader>, format: &Format) -> Result<Action, LinkError> {
+    let (payload, expected) = (sample.payload(), format.layout().action_bytes);
+    let found = payload.len();
+    if found != expected {
+        return Err(LinkError::MessageLength { service: "action", found, expected });
+    }
+    let ActionHeader { answers, published_ns, source, .. } = *sample.user_header();
+    let numbers: &[f32] = bytemuck::cast_slice(payload);
+    let action = ActionValues::from_fn(numbers.len(), |at| numbers[at]);
+    Ok(Action { answers, published_ns, source, action })
+}
+
+/// One direction of an instance, once its robot was found.
+struct Listener<H: super::direction::Header> {
+    settings: LinkSettings,
+    topic: &'static str,
+    found: OnceCell<(Arc<Format>, Receiver<H>)>,
+    inquirer: Inquirer,
+    // Dropped last: the ports above belong to it.
+    node: Node<Ipc>,
+}
+
+impl<H: super::direction::Header> Listener<H> {
+    fn open(settings: LinkSettings, topic: &'static str) -> Result<Self, LinkError> {
         join(&settings.clone(), 0, |node| {
-            let observations =
-                Direction::<Observation>::open(&node, &settings.instance, "observation")?.receiver()?;
-            Ok(Self { settings, observations, _node: node })
+            let inquirer = Inquirer::open(&node, &settings.instance)?;
+            Ok(Self { settings, topic, found: OnceCell::new(), inquirer, node })
         })
+    }
+
+    fn find(&self, timeout: Duration) -> Result<Option<&(Arc<Format>, Receiver<H>)>, LinkError> {
+        if let Some(found) = self.found.get() {
+            return Ok(Some(found));
+        }
+        let Some(interface) = await_robot(&self.inquirer, timeout)? else { return Ok(None) };
+        let format = Format::of(interface);
+        let (instance, interface_hash) = (self.settings.instance.as_str(), Some(format.hash()));
+        let topic = Topic { instance, name: self.topic, interface_hash, history: false };
+        let receiver = Direction::open(&self.node, &topic)?.receiver()?;
+        Ok(Some(self.found.get_or_init(|| (Arc::clone(&format), receiver))))
+    }
+}
+
+/// Receives observations without taking part: nobody waits for it, and it sees the newest only.
+pub struct ObserverLink(Listener<ObservationHeader>);
+
+impl ObserverLink {
+    /// Joins an instance, whose robot may come later.
+    ///
+    /// # Errors
+    /// See [`LinkError`].
+    pub fn open(settings: LinkSettings) -> Result<Self, LinkError> {
+        Listener::open(settings, "observation").map(Self)
+    }
+
+    /// Waits until the robot has said its interface.
+    ///
+    /// # Errors
+    /// See [`LinkError`].
+    pub fn wait_robot(&self, timeout: Duration) -> Result<Option<Arc<Format>>, LinkError> {
+        Ok(self.0.find(timeout)?.map(|(format, _)| Arc::clone(format)))
     }
 
     /// Waits for the next observation; [`Wait::Closed`] when the simulator has said that none will come.
     ///
     /// # Errors
     /// [`LinkError::Traffic`].
-    pub fn wait_observation(&self, timeout: Duration) -> Result<Wait<Received<Observation>>, LinkError> {
-        Ok(self.observations.wait(self.settings.spin, timeout)?.0)
+    pub fn wait_observation(&self, timeout: Duration) -> Result<Wait<Observation>, LinkError> {
+        let start = Instant::now();
+        let Some((format, observations)) = self.0.find(timeout)? else { return Ok(Wait::TimedOut) };
+        let left = timeout.saturating_sub(start.elapsed());
+        Ok(match observations.wait(self.0.settings.spin, left)?.0 {
+            Wait::Message(sample) => Wait::Message(observation_of(sample, format)?),
+            Wait::TimedOut => Wait::TimedOut,
+            Wait::Closed => Wait::Closed,
+        })
     }
 }
 
 /// Receives actions without taking part, for a monitor beside the simulator: the newest only.
-pub struct ActionObserverLink {
-    actions: Receiver<Action>,
-    // Dropped last: the port above belongs to it.
-    _node: Node<Ipc>,
-}
+pub struct ActionObserverLink(Listener<ActionHeader>);
 
 impl ActionObserverLink {
-    /// Opens or creates the action service of an instance.
+    /// Joins an instance, whose robot may come later.
+    ///
+    /// # Errors
+    /// See [`LinkError`].
     pub fn open(settings: &LinkSettings) -> Result<Self, LinkError> {
-        join(settings, 0, |node| {
-            let actions = Direction::<Action>::open(&node, &settings.instance, "action")?.receiver()?;
-            Ok(Self { actions, _node: node })
-        })
+        Listener::open(settings.clone(), "action").map(Self)
     }
 
     /// The newest action, if one is waiting; never blocks.
@@ -57,8 +136,9 @@ impl ActionObserverLink {
     /// # Errors
     /// [`LinkError::Traffic`].
     pub fn poll_action(&self) -> Result<Option<Action>, LinkError> {
+        let Some((format, actions)) = self.0.find(Duration::ZERO)? else { return Ok(None) };
         // Signals are not looked at; they must not pile up.
-        self.actions.take_events()?;
-        Ok(self.actions.poll()?.map(|sample| *sample.payload()))
+        actions.take_events()?;
+        actions.poll()?.map(|sample| action_of(&sample, format)).transpose()
     }
 }

@@ -1,75 +1,86 @@
 //! The simulator's end.
 
-use std::time::Duration;
+use std::sync::Arc;
+use std::time::{Duration, Instant};
 
 use iceoryx2::prelude::Node;
 
-use super::direction::{Direction, EVENT_CLOSED, EVENT_PUBLISHED, Receiver, Sender};
+use super::announce::Announcer;
+use super::direction::{Direction, EVENT_CLOSED, Loan, Receiver, Sender, Topic};
 use super::domain::join;
-use super::error::traffic;
+use super::observer::action_of;
 use super::{Events, Ipc, LinkError, LinkSettings, Wait};
 use crate::wire::clock::monotonic_ns;
-use crate::wire::{Action, Observation};
+use crate::wire::{Action, ActionHeader, Format, ObservationHeader, ObservationMut};
 
 /// The simulator's end (or a robot's): publishes observations, receives actions.
 pub struct SimulatorLink {
     settings: LinkSettings,
-    observations: Sender<Observation>,
-    actions: Receiver<Action>,
+    format: Arc<Format>,
+    announcer: Announcer,
+    observations: Sender<ObservationHeader>,
+    actions: Receiver<ActionHeader>,
     // Dropped last: the ports above belong to it.
     node: Node<Ipc>,
 }
 
 /// A free place in shared memory for the next observation.
 pub struct ObservationSlot {
-    sample: iceoryx2::sample_mut::SampleMut<Ipc, Observation, ()>,
+    header: ObservationHeader,
+    sample: Loan<ObservationHeader>,
+    format: Arc<Format>,
 }
 
-impl std::ops::Deref for ObservationSlot {
-    type Target = Observation;
-    fn deref(&self) -> &Observation {
-        self.sample.payload()
-    }
-}
-
-impl std::ops::DerefMut for ObservationSlot {
-    fn deref_mut(&mut self) -> &mut Observation {
-        self.sample.payload_mut()
+impl ObservationSlot {
+    pub fn edit(&mut self) -> ObservationMut<'_> {
+        let payload = self.sample.payload_mut();
+        ObservationMut { header: &mut self.header, format: &self.format, payload }
     }
 }
 
 impl SimulatorLink {
-    /// Opens or creates the services of an instance, as their simulator.
+    /// Opens or creates the services of an instance, as their simulator, and says what it offers.
     ///
     /// # Errors
     /// See [`LinkError`]; a second simulator gets [`LinkError::Taken`].
-    pub fn open(settings: LinkSettings) -> Result<Self, LinkError> {
-        join(&settings.clone(), size_of::<Observation>(), |node| {
-            let observation = Direction::<Observation>::open(&node, &settings.instance, "observation")?;
-            let action = Direction::<Action>::open(&node, &settings.instance, "action")?;
-            let actions = action.receiver()?;
-            let observations = observation.sender("simulator")?;
-            Ok(Self { settings, observations, actions, node })
-        })
+    pub fn open(settings: LinkSettings, format: &Arc<Format>) -> Result<Self, LinkError> {
+        let bytes = format.layout().observation_bytes;
+        let link = join(&settings.clone(), bytes, |node| {
+            let (instance, interface_hash) = (settings.instance.as_str(), Some(format.hash()));
+            let topic = |name| Topic { instance, name, interface_hash, history: false };
+            let actions = Direction::open(&node, &topic("action"))?.receiver()?;
+            let observations =
+                Direction::open(&node, &topic("observation"))?.sender("simulator", bytes)?;
+            let announcer = Announcer::open(&node, instance, format)?;
+            Ok(Self { settings, format: Arc::clone(format), announcer, observations, actions, node })
+        })?;
+        link.announcer.announce()?;
+        Ok(link)
+    }
+
+    #[must_use]
+    pub fn format(&self) -> &Arc<Format> {
+        &self.format
     }
 
     /// Publishes one observation and wakes the controller. `published_ns` is set here.
     ///
     /// # Errors
     /// [`LinkError::Traffic`].
-    pub fn publish(&self, fill: impl FnOnce(&mut Observation)) -> Result<(), LinkError> {
+    pub fn publish(&self, fill: impl FnOnce(&mut ObservationMut<'_>)) -> Result<(), LinkError> {
         let mut slot = self.slot()?;
-        fill(&mut slot);
+        fill(&mut slot.edit());
         self.send(slot)
     }
 
-    /// A zeroed place in shared memory, to be filled and sent.
+    /// A place in shared memory of zeros, to be filled and sent.
     ///
     /// # Errors
     /// [`LinkError::Traffic`].
     pub fn slot(&self) -> Result<ObservationSlot, LinkError> {
-        let sample = self.observations.publisher.loan_uninit().map_err(traffic("loaning an observation"))?;
-        Ok(ObservationSlot { sample: sample.write_payload(Observation::zeroed()) })
+        let sample = self.observations.loan(self.format.layout().observation_bytes)?;
+        let header = ObservationHeader::zeroed();
+        Ok(ObservationSlot { header, sample, format: Arc::clone(&self.format) })
     }
 
     /// Sends a filled place and wakes the controller. `published_ns` is set here.
@@ -77,13 +88,13 @@ impl SimulatorLink {
     /// # Errors
     /// [`LinkError::Traffic`].
     pub fn send(&self, mut slot: ObservationSlot) -> Result<(), LinkError> {
-        slot.published_ns = monotonic_ns();
-        if slot.period_ns == 0 {
+        slot.header.published_ns = monotonic_ns();
+        if slot.header.period_ns == 0 {
             // In lock-step nothing is due at a time of its own.
-            slot.scheduled_ns = slot.published_ns;
+            slot.header.scheduled_ns = slot.header.published_ns;
         }
-        slot.sample.send().map_err(traffic("publishing an observation"))?;
-        self.observations.notify(EVENT_PUBLISHED)
+        *slot.sample.user_header_mut() = slot.header;
+        self.observations.send(slot.sample)
     }
 
     /// Waits for the next action of any sequence.
@@ -94,14 +105,28 @@ impl SimulatorLink {
     /// # Errors
     /// [`LinkError::Traffic`].
     pub fn wait_action(&self, timeout: Duration) -> Result<(Wait<Action>, Events), LinkError> {
-        let (wait, events) = self.actions.wait(self.settings.spin, timeout)?;
-        let wait = match wait {
-            Wait::Message(sample) => Wait::Message(*sample.payload()),
-            Wait::TimedOut => Wait::TimedOut,
-            // A controller may come and go; only its absence matters here.
-            Wait::Closed => Wait::TimedOut,
-        };
-        Ok((wait, events))
+        let start = Instant::now();
+        loop {
+            let left = timeout.saturating_sub(start.elapsed());
+            let (wait, events) = self.actions.wait(self.settings.spin, left)?;
+            let asked = self.tell(events)?;
+            let wait = match wait {
+                Wait::Message(sample) => Wait::Message(action_of(&sample, &self.format)?),
+                Wait::TimedOut if asked && !events.hello && start.elapsed() < timeout => continue,
+                Wait::TimedOut => Wait::TimedOut,
+                // A controller may come and go; only its absence matters here.
+                Wait::Closed => Wait::TimedOut,
+            };
+            return Ok((wait, events));
+        }
+    }
+
+    /// Says the interface where somebody has asked.
+    fn tell(&self, events: Events) -> Result<bool, LinkError> {
+        if events.asked {
+            self.announcer.announce()?;
+        }
+        Ok(events.asked)
     }
 
     /// The newest action, if one is waiting; never blocks.
@@ -109,7 +134,7 @@ impl SimulatorLink {
     /// # Errors
     /// [`LinkError::Traffic`].
     pub fn poll_action(&self) -> Result<Option<Action>, LinkError> {
-        Ok(self.actions.poll()?.map(|sample| *sample.payload()))
+        self.actions.poll()?.map(|sample| action_of(&sample, &self.format)).transpose()
     }
 
     /// Signals since the last look; never blocks.
@@ -117,7 +142,9 @@ impl SimulatorLink {
     /// # Errors
     /// [`LinkError::Traffic`].
     pub fn poll_events(&self) -> Result<Events, LinkError> {
-        self.actions.take_events()
+        let events = self.actions.take_events()?;
+        self.tell(events)?;
+        Ok(events)
     }
 
     /// Frees what peers that were killed have left in shared memory.

@@ -1,0 +1,86 @@
+//! What the messages of one interface look like.
+
+use std::sync::Arc;
+
+use super::ActionValues;
+use crate::interface::{Interface, Layout};
+
+/// By how much of its range a robot may report more than a limit allows as executed: it may have rounded.
+const EXECUTED_ROUNDING: f32 = 5e-4;
+
+/// An interface with all that its messages need to be read and checked.
+#[derive(Debug, PartialEq)]
+pub struct Format {
+    interface: Interface,
+    layout: Layout,
+    hash: String,
+    low: ActionValues,
+    high: ActionValues,
+}
+
+impl Format {
+    #[must_use]
+    pub fn of(interface: Interface) -> Arc<Self> {
+        let limits = |of: fn(&crate::interface::Action) -> &Vec<f64>| {
+            interface.action.iter().flat_map(of).map(|x| *x as f32).collect()
+        };
+        let (low, high) = (limits(|action| &action.low), limits(|action| &action.high));
+        Arc::new(Self { layout: Layout::of(&interface), hash: interface.hash(), low, high, interface })
+    }
+
+    /// That of Meta-World's arm.
+    #[must_use]
+    pub fn metaworld() -> Arc<Self> {
+        Self::of(Interface::metaworld())
+    }
+
+    #[must_use]
+    pub fn interface(&self) -> &Interface {
+        &self.interface
+    }
+
+    #[must_use]
+    pub fn layout(&self) -> &Layout {
+        &self.layout
+    }
+
+    /// See [`Interface::hash`].
+    #[must_use]
+    pub fn hash(&self) -> &str {
+        &self.hash
+    }
+
+    /// Numbers of an action.
+    #[must_use]
+    pub fn action_numbers(&self) -> usize {
+        self.low.len()
+    }
+
+    /// An action of zeros.
+    #[must_use]
+    pub fn zeros(&self) -> ActionValues {
+        ActionValues::zeros(self.action_numbers())
+    }
+
+    /// Whether a robot may execute this action: as many numbers as the interface has, each finite and within its limits.
+    #[must_use]
+    pub fn is_within_limits(&self, action: &[f32]) -> bool {
+        self.is_near_limits(action, 0.0)
+    }
+
+    /// Whether a robot can have executed this action: within the limits but for rounding.
+    #[must_use]
+    pub fn is_executable(&self, action: &[f32]) -> bool {
+        self.is_near_limits(action, EXECUTED_ROUNDING)
+    }
+
+    fn is_near_limits(&self, action: &[f32], beyond: f32) -> bool {
+        let limits = self.low.iter().zip(self.high.iter());
+        // NaN is within nothing.
+        let fits = |(x, (low, high)): (&f32, (&f32, &f32))| {
+            let beyond = beyond * (high - low);
+            low - beyond <= *x && *x <= high + beyond
+        };
+        action.len() == self.low.len() && action.iter().zip(limits).all(fits)
+    }
+}
