@@ -34,7 +34,6 @@ fn a_record_allocates_nothing_in_the_loop_s_thread() {
             answers: u64::from(step),
             published_ns: 3,
             source: 0,
-            reserved: 0,
             action: decision.action,
         };
         let tick = Tick {

@@ -9,7 +9,7 @@ use std::time::Duration;
 
 use rcwm_models::bundle::PartName;
 use rcwm_models::wire::{
-    Action, ActionSource, ControllerLink, LinkError, ObservationFlags, ObservationSample, SimulatorLink, Wait,
+    Action, ActionSource, ControllerLink, LinkError, ObservationFlags, Observation, SimulatorLink, Wait,
 };
 use rcwm_runtime::controller::{
     Cause, Controller, ControllerError, ControllerSettings, Ended, Fallback, State, SurpriseLimits,
@@ -165,12 +165,12 @@ impl Transport for JustInTime {
         Transport::now_ns(&self.link)
     }
 
-    fn wait(&self, spin: Duration, timeout: Duration) -> Result<Wait<ObservationSample>, LinkError> {
+    fn wait(&self, spin: Duration, timeout: Duration) -> Result<Wait<Observation>, LinkError> {
         self.found_nothing.set(false);
         Transport::wait(&self.link, spin, timeout)
     }
 
-    fn poll(&self) -> Result<Option<ObservationSample>, LinkError> {
+    fn poll(&self) -> Result<Option<Observation>, LinkError> {
         if self.found_nothing.get() {
             let mut again = due_now(0);
             again.flags |= ObservationFlags::REPEATED.0;

@@ -91,7 +91,7 @@ fn a_python_robot_executes_no_action_that_is_not_finite_or_out_of_range() {
         for bad in [f32::NAN, f32::INFINITY, 1.5, 0.5] {
             let action = [0.0, bad, 0.0, 0.0];
             let answers = observation.sequence;
-            controller.send(Action { answers, published_ns: 0, source: 0, reserved: 0, action }).unwrap();
+            controller.send(Action { answers, published_ns: 0, source: 0, action }).unwrap();
             // Only the newest action is kept: each is to be seen.
             std::thread::sleep(Duration::from_millis(20));
         }

@@ -6,8 +6,10 @@ use std::path::{Component, Path, PathBuf};
 use prost::Message;
 
 use super::graph::{self, GraphError};
-use super::manifest::{FORMAT, FileEntry, Manifest, PartEntry, PartName, TensorSpec};
+use super::manifest::{FORMAT, FileEntry, Limits, Manifest, PartEntry, PartName, TensorSpec};
+use super::version1::ManifestV1;
 use super::{DType, GOLDEN_BYTES_MAX, MANIFEST_BYTES_MAX, MANIFEST_FILE, PART_BYTES_MAX, PARTS_BYTES_MAX};
+use crate::interface::Action;
 use crate::files::{FileError, read_capped, sha256_hex};
 use crate::onnx::{self, OnnxError};
 use crate::settings::{ModelKind, SettingsError};
@@ -32,7 +34,7 @@ pub enum BundleError {
     },
     /// The bundle was written for another version.
     #[error(
-        "bundle: format {found}, this program reads format {FORMAT}; export it again with the matching trainer"
+        "bundle: format {found}, this program reads formats 1 and {FORMAT}; export it again with the matching trainer"
     )]
     Format {
         /// The format found.
@@ -163,10 +165,11 @@ fn read_manifest(path: &Path) -> Result<Manifest, BundleError> {
     }
     let not_understood = |error: toml::de::Error| wrong(said_of(&error, &text));
     let Versioned { format } = toml::from_str(&text).map_err(not_understood)?;
-    if format != FORMAT {
-        return Err(BundleError::Format { found: format });
-    }
-    let manifest: Manifest = toml::from_str(&text).map_err(not_understood)?;
+    let manifest = match format {
+        1 => Manifest::from(toml::from_str::<ManifestV1>(&text).map_err(not_understood)?),
+        FORMAT => toml::from_str(&text).map_err(not_understood)?,
+        found => return Err(BundleError::Format { found }),
+    };
     manifest.check()?;
     Ok(manifest)
 }
@@ -189,19 +192,19 @@ impl Manifest {
         if self.model.kind != ModelKind::Rcwm {
             return Err(BundleError::Invalid("model.kind: only rcwm bundles can be deployed so far".into()));
         }
-        let control = &self.control;
-        if !(control.rate_hz > 0.0 && control.rate_hz <= 10_000.0) {
+        self.interface.check().map_err(|error| BundleError::Invalid(error.to_string()))?;
+        let (numbers, model) = (self.interface.action_numbers(), self.model.action);
+        if numbers != model {
             return Err(BundleError::Invalid(format!(
-                "control.rate_hz = {}, expected 0 to 10000",
-                control.rate_hz
+                "the interface has {numbers} numbers of actions, model.action = {model}"
             )));
         }
-        for (low, high) in control.action_low.iter().zip(&control.action_high) {
-            // Written so that NaN fails.
-            if !(*low >= -1.0 && *high <= 1.0 && low < high) {
+        self.check_limits()?;
+        for name in &self.policy.inputs {
+            let camera = self.interface.camera.iter().any(|camera| camera.name == *name);
+            if !camera && !self.interface.state.iter().any(|state| state.name == *name) {
                 return Err(BundleError::Invalid(format!(
-                    "control: action limits {low} to {high}, expected low < high, both in [-1, 1] as on the wire; scale the \
-                     policy's actions to that and export it again"
+                    "policy.inputs: {name:?} is no camera or state of the interface"
                 )));
             }
         }
@@ -223,6 +226,39 @@ impl Manifest {
             let (inputs, outputs) = entry.name.signature(&self.model);
             expect_specs(entry.name, "the manifest's inputs", &entry.inputs, &inputs)?;
             expect_specs(entry.name, "the manifest's outputs", &entry.outputs, &outputs)?;
+        }
+        Ok(())
+    }
+}
+
+impl Manifest {
+    /// The smallest and the largest values of the policy's actions, in units.
+    #[must_use]
+    pub fn limits(&self) -> Limits {
+        let all = |of: fn(&Action) -> &Vec<f64>| {
+            self.interface.action.iter().flat_map(of).map(|x| *x as f32).collect()
+        };
+        let widest = || Limits { low: all(|action| &action.low), high: all(|action| &action.high) };
+        self.policy.limits.clone().unwrap_or_else(widest)
+    }
+
+    fn check_limits(&self) -> Result<(), BundleError> {
+        let Some(Limits { low, high }) = &self.policy.limits else { return Ok(()) };
+        let numbers = self.interface.action_numbers();
+        if low.len() != numbers || high.len() != numbers {
+            let found = (low.len(), high.len());
+            return Err(BundleError::Invalid(format!(
+                "policy.limits: {found:?} numbers, expected {numbers} each"
+            )));
+        }
+        let widest = self.interface.action.iter().flat_map(|action| action.low.iter().zip(&action.high));
+        for ((low, high), (lowest, highest)) in low.iter().zip(high).zip(widest) {
+            // Written so that NaN fails.
+            if !(*low >= *lowest as f32 && *high <= *highest as f32 && low < high) {
+                return Err(BundleError::Invalid(format!(
+                    "policy.limits: {low} to {high}, expected low < high, both within the interface's {lowest} to {highest}"
+                )));
+            }
         }
         Ok(())
     }

@@ -2,12 +2,12 @@
 
 use serde::{Deserialize, Serialize};
 
-use crate::interface::ActionMode;
+use crate::interface::Interface;
 use crate::settings::ModelSettings;
-use crate::{ACTION_LEN, IMAGE_CHANNELS, IMAGE_SIDE};
+use crate::{IMAGE_CHANNELS, IMAGE_SIDE};
 
 /// Version of the bundle format this crate reads and writes.
-pub const FORMAT: u32 = 1;
+pub const FORMAT: u32 = 2;
 
 /// Everything known about a bundle.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
@@ -15,12 +15,14 @@ pub const FORMAT: u32 = 1;
 pub struct Manifest {
     /// [`FORMAT`].
     pub format: u32,
+    pub kind: BundleKind,
     /// Name of the task the policy was made for, or `own`.
     pub task: String,
     /// The sizes of the model.
     pub model: ModelSettings,
-    /// How the policy is to be run.
-    pub control: Control,
+    /// What a robot must offer, and the limits of what it is commanded.
+    pub interface: Interface,
+    pub policy: PolicyInputs,
     /// Where it comes from.
     pub provenance: Provenance,
     /// The learned initial state.
@@ -31,19 +33,31 @@ pub struct Manifest {
     pub parts: Vec<PartEntry>,
 }
 
-/// How the policy is to be run.
+/// Which parts a policy has, and so what a runtime can do with it.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(rename_all = "lowercase")]
+pub enum BundleKind {
+    /// Robot and environment branch with their interaction.
+    Rcwm,
+}
+
+/// What of the interface the policy reads.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
-pub struct Control {
-    /// Decisions per second the policy was trained for, in Hz.
-    pub rate_hz: f64,
-    /// Smallest value of each action component.
-    pub action_low: [f32; ACTION_LEN],
-    /// Largest value of each action component.
-    pub action_high: [f32; ACTION_LEN],
-    /// What an action commands; left out, it is a displacement.
-    #[serde(default, skip_serializing_if = "ActionMode::is_default")]
-    pub action_mode: ActionMode,
+pub struct PolicyInputs {
+    /// Names of cameras and states; cameras in the order of their channels.
+    pub inputs: Vec<String>,
+    /// Limits within those of the interface, in its units, that no action of this policy leaves; none: those of the interface.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub limits: Option<Limits>,
+}
+
+/// Smallest and largest value of each number of an action.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct Limits {
+    pub low: Vec<f32>,
+    pub high: Vec<f32>,
 }
 
 /// Where a bundle comes from.

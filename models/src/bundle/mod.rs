@@ -21,12 +21,13 @@ mod fits;
 mod graph;
 mod load;
 mod manifest;
+mod version1;
 
 pub use crate::interface::ActionMode;
 pub use graph::GraphError;
 pub use load::{Bundle, BundleError, InitialState};
 pub use manifest::{
-    Control, DType, FORMAT, FileEntry, Manifest, PartEntry, PartName, Provenance, TensorSpec,
+    BundleKind, DType, FORMAT, Limits, FileEntry, Manifest, PartEntry, PartName, PolicyInputs, Provenance, TensorSpec,
 };
 
 /// File name of the manifest.

@@ -237,7 +237,7 @@ impl EpisodeBuilder {
     /// # Errors
     /// [`EpisodeError::Order`] when the episode was already over, begins again in its middle, grows beyond
     /// [`STEPS_MAX`], or the observation is not [valid](Observation::is_valid).
-    pub fn push(&mut self, observation: &Observation) -> Result<(), EpisodeError> {
+    pub fn push(&mut self, observation: &Observation<'_>) -> Result<(), EpisodeError> {
         let flags = ObservationFlags(observation.flags);
         let refuse = |reason: &str| {
             let (episode, step) = (observation.episode, observation.step);

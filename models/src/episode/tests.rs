@@ -1,8 +1,8 @@
 use super::*;
-use crate::wire::Format;
+use crate::wire::{Format, OwnedObservation};
 
-fn observation(step: u32, last: bool, mask: bool) -> Observation {
-    let mut whole = Observation::zeroed(&Format::metaworld());
+fn observation(step: u32, last: bool, mask: bool) -> OwnedObservation {
+    let mut whole = OwnedObservation::zeroed(&Format::metaworld());
     let mut observation = whole.edit();
     observation.step = step;
     observation.flags = ObservationFlags::default()
@@ -22,7 +22,7 @@ fn observation(step: u32, last: bool, mask: bool) -> Observation {
 fn an_episode_survives_the_file() {
     let mut builder = EpisodeBuilder::new();
     for step in 0..4 {
-        builder.push(&observation(step, step == 3, true)).unwrap();
+        builder.push(&observation(step, step == 3, true).view()).unwrap();
     }
     let episode = builder.finish().unwrap();
     let folder = tempfile::tempdir().unwrap();
@@ -36,8 +36,8 @@ fn an_episode_survives_the_file() {
 #[test]
 fn masks_are_kept_only_when_every_step_has_one() {
     let mut builder = EpisodeBuilder::new();
-    builder.push(&observation(0, false, true)).unwrap();
-    builder.push(&observation(1, true, false)).unwrap();
+    builder.push(&observation(0, false, true).view()).unwrap();
+    builder.push(&observation(1, true, false).view()).unwrap();
     assert!(builder.finish().unwrap().robot_mask.is_none());
     assert!(builder.finish().is_none(), "the builder starts anew");
 }
@@ -45,13 +45,13 @@ fn masks_are_kept_only_when_every_step_has_one() {
 #[test]
 fn an_episode_neither_restarts_nor_goes_on_after_its_end() {
     let mut builder = EpisodeBuilder::new();
-    builder.push(&observation(0, false, true)).unwrap();
-    assert!(builder.push(&observation(0, false, true)).is_err());
-    builder.push(&observation(1, true, true)).unwrap();
-    assert!(builder.push(&observation(2, false, true)).is_err());
+    builder.push(&observation(0, false, true).view()).unwrap();
+    assert!(builder.push(&observation(0, false, true).view()).is_err());
+    builder.push(&observation(1, true, true).view()).unwrap();
+    assert!(builder.push(&observation(2, false, true).view()).is_err());
     let mut poisoned = observation(0, false, true);
     poisoned.reward = f32::NAN;
-    assert!(EpisodeBuilder::new().push(&poisoned).is_err());
+    assert!(EpisodeBuilder::new().push(&poisoned.view()).is_err());
 }
 
 #[test]
@@ -75,7 +75,7 @@ fn a_second_look_survives_the_file_and_a_pipe_in_its_place_is_not_waited_for() {
 #[test]
 fn a_damaged_file_is_one_clear_error() {
     let mut builder = EpisodeBuilder::new();
-    builder.push(&observation(0, true, true)).unwrap();
+    builder.push(&observation(0, true, true).view()).unwrap();
     let folder = tempfile::tempdir().unwrap();
     let path = folder.path().join("episode.npz");
     builder.finish().unwrap().write(&path).unwrap();

@@ -27,7 +27,7 @@ fn invalid(place: &str, found: impl Into<String>, expected: &str) -> Checked {
 }
 
 impl Interface {
-    pub(super) fn check(&self) -> Checked {
+    pub(crate) fn check(&self) -> Checked {
         check_name("name", &self.name)?;
         if !RATES_HZ.contains(&self.rate_hz) {
             let found = format!("rate_hz = {}", self.rate_hz);

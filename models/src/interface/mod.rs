@@ -141,12 +141,6 @@ pub enum ActionMode {
     Absolute,
 }
 
-impl ActionMode {
-    pub(crate) fn is_default(&self) -> bool {
-        *self == Self::default()
-    }
-}
-
 /// What is commanded when there is no decision.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 #[serde(

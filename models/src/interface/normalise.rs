@@ -33,10 +33,10 @@ impl Normaliser {
     pub fn to_units(&self, action: &[f32], units: &mut [f32]) -> Result<(), NotFinite> {
         finite(action)?;
         for (((to, x), low), high) in units.iter_mut().zip(action).zip(&self.low).zip(&self.high) {
-            // In f64, where neither the width nor the sum can overflow or miss an end.
-            let (low_64, high_64) = (f64::from(*low), f64::from(*high));
-            let at = low_64 + 0.5 * (f64::from(*x) + 1.0) * (high_64 - low_64);
-            *to = (at.clamp(low_64, high_64)) as f32;
+            // In f64, where neither the width nor the sum can overflow or miss an end. Limits of -1 and 1 change no bit.
+            let (low, high) = (f64::from(*low), f64::from(*high));
+            let (middle, half) = (0.5 * (low + high), 0.5 * (high - low));
+            *to = (middle + half * f64::from(*x)).clamp(low, high) as f32;
         }
         Ok(())
     }
@@ -49,8 +49,8 @@ impl Normaliser {
         finite(units)?;
         for (((to, x), low), high) in action.iter_mut().zip(units).zip(&self.low).zip(&self.high) {
             let (low, high) = (f64::from(*low), f64::from(*high));
-            let at = 2.0 * (f64::from(*x) - low) / (high - low) - 1.0;
-            *to = at.clamp(-1.0, 1.0) as f32;
+            let (middle, half) = (0.5 * (low + high), 0.5 * (high - low));
+            *to = ((f64::from(*x) - middle) / half).clamp(-1.0, 1.0) as f32;
         }
         Ok(())
     }

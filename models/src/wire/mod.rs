@@ -34,4 +34,4 @@ pub use link::{
     SimulatorLink, Wait, forget_prefix, list_leftovers, say_closed_for, shared_memory_number,
 };
 pub use messages::{ActionHeader, CAMERAS_MAX, ObservationFlags, ObservationHeader, WIRE};
-pub use observation::{Observation, ObservationMut};
+pub use observation::{Observation, ObservationMut, ObservationSample, OwnedObservation};

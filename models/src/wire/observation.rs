@@ -14,54 +14,30 @@ use super::{ActionValues, Format, ObservationHeader};
 #[repr(C, align(64))]
 struct Line([u8; 64]);
 
-/// What a simulator or a robot saw, and what it had done to get there: a complete transition. In shared memory, or a copy of its own.
+/// What a simulator or a robot saw, and what it had done to get there: a complete transition, wherever it lies.
 ///
 /// Images are upright, rows first, channels last (RGB). Numbers are in the interface's units and order.
-pub struct Observation {
-    header: ObservationHeader,
-    format: Arc<Format>,
-    payload: Payload,
+#[derive(Clone, Copy)]
+pub struct Observation<'a> {
+    header: &'a ObservationHeader,
+    format: &'a Arc<Format>,
+    payload: &'a [u8],
 }
 
-enum Payload {
-    Own(Vec<Line>),
-    Shared(Sample<Ipc, [u8], ObservationHeader>),
-}
-
-impl Deref for Observation {
+impl Deref for Observation<'_> {
     type Target = ObservationHeader;
     fn deref(&self) -> &ObservationHeader {
-        &self.header
+        self.header
     }
 }
 
-impl DerefMut for Observation {
-    fn deref_mut(&mut self) -> &mut ObservationHeader {
-        &mut self.header
-    }
-}
-
-impl Clone for Observation {
-    fn clone(&self) -> Self {
-        let mut copy = Self::zeroed(&self.format);
-        copy.clone_from(self);
-        copy
-    }
-
-    /// Allocates nothing where both are of one format.
-    fn clone_from(&mut self, source: &Self) {
-        self.take_header(source);
-        self.edit().payload.copy_from_slice(source.payload());
-    }
-}
-
-impl PartialEq for Observation {
+impl PartialEq for Observation<'_> {
     fn eq(&self, other: &Self) -> bool {
-        self.header == other.header && self.format == other.format && self.payload() == other.payload()
+        self.header == other.header && self.format == other.format && self.payload == other.payload
     }
 }
 
-impl std::fmt::Debug for Observation {
+impl std::fmt::Debug for Observation<'_> {
     fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
         let (state, executed) = (self.state(), self.executed());
         f.debug_struct("Observation")
@@ -72,60 +48,23 @@ impl std::fmt::Debug for Observation {
     }
 }
 
-impl Observation {
-    /// An observation of zeros.
+impl<'a> Observation<'a> {
     #[must_use]
-    pub fn zeroed(format: &Arc<Format>) -> Self {
-        let lines = format.layout().observation_bytes / size_of::<Line>();
-        let payload = Payload::Own(vec![Line([0; 64]); lines]);
-        Self { header: ObservationHeader::zeroed(), format: Arc::clone(format), payload }
-    }
-
-    /// One that was received; its payload is as long as the format says.
-    pub(super) fn of_sample(
-        sample: Sample<Ipc, [u8], ObservationHeader>,
-        format: &Arc<Format>,
-    ) -> Result<Self, usize> {
-        let found = sample.payload().len();
-        if found != format.layout().observation_bytes || !sample.payload().as_ptr().cast::<Line>().is_aligned() {
-            return Err(found);
-        }
-        let header = *sample.user_header();
-        Ok(Self { header, format: Arc::clone(format), payload: Payload::Shared(sample) })
-    }
-
-    #[must_use]
-    pub fn format(&self) -> &Arc<Format> {
-        &self.format
-    }
-
-    /// Which publisher it is from; 0 for a copy.
-    #[must_use]
-    pub fn origin(&self) -> u128 {
-        match &self.payload {
-            Payload::Own(_) => 0,
-            Payload::Shared(sample) => sample.origin().value(),
-        }
-    }
-
-    fn payload(&self) -> &[u8] {
-        match &self.payload {
-            Payload::Own(lines) => cast_slice(lines),
-            Payload::Shared(sample) => sample.payload(),
-        }
+    pub fn format(&self) -> &'a Arc<Format> {
+        self.format
     }
 
     /// All measured numbers, one state after the other.
     #[must_use]
-    pub fn state(&self) -> &[f32] {
-        cast_slice(&self.payload()[self.format.layout().state.bytes.clone()])
+    pub fn state(&self) -> &'a [f32] {
+        cast_slice(&self.payload[self.format.layout().state.bytes.clone()])
     }
 
     /// The action that led here, as executed. At the first of an episode zeros, or, where actions are absolute positions, the one that the
     /// robot holds.
     #[must_use]
-    pub fn executed(&self) -> &[f32] {
-        cast_slice(&self.payload()[self.format.layout().executed.bytes.clone()])
+    pub fn executed(&self) -> &'a [f32] {
+        cast_slice(&self.payload[self.format.layout().executed.bytes.clone()])
     }
 
     /// The same, copied.
@@ -136,15 +75,15 @@ impl Observation {
 
     /// The picture of a camera, by its place in the interface.
     #[must_use]
-    pub fn image(&self, camera: usize) -> &[u8] {
-        &self.payload()[self.format.layout().cameras[camera].bytes.clone()]
+    pub fn image(&self, camera: usize) -> &'a [u8] {
+        &self.payload[self.format.layout().cameras[camera].bytes.clone()]
     }
 
     /// A camera's mask, 255 where the robot is, else 0; none where the camera has none or this observation came without.
     #[must_use]
-    pub fn mask(&self, camera: usize) -> Option<&[u8]> {
+    pub fn mask(&self, camera: usize) -> Option<&'a [u8]> {
         let block = self.format.layout().masks[camera].as_ref()?;
-        self.is(super::ObservationFlags::MASK_VALID).then(|| &self.payload()[block.bytes.clone()])
+        self.is(super::ObservationFlags::MASK_VALID).then(|| &self.payload[block.bytes.clone()])
     }
 
     /// Whether the executed action is one that a robot can have executed: every component finite and, but for rounding, within its limits.
@@ -165,34 +104,122 @@ impl Observation {
         let numbers = self.executed().iter().chain(self.state());
         self.reward.is_finite() && numbers.copied().all(f32::is_finite)
     }
+}
 
-    fn take_header(&mut self, from: &Self) {
-        if !Arc::ptr_eq(&self.format, &from.format) || matches!(self.payload, Payload::Shared(_)) {
-            *self = Self::zeroed(&from.format);
+/// An observation that was received; it stays valid while this is held.
+#[derive(Debug)]
+pub struct ObservationSample {
+    header: ObservationHeader,
+    format: Arc<Format>,
+    sample: Sample<Ipc, [u8], ObservationHeader>,
+}
+
+impl ObservationSample {
+    /// Its payload must be as long as the format says; if not, how long it is.
+    pub(super) fn new(
+        sample: Sample<Ipc, [u8], ObservationHeader>,
+        format: &Arc<Format>,
+    ) -> Result<Self, usize> {
+        let payload = sample.payload();
+        let fits = payload.len() == format.layout().observation_bytes;
+        if !fits || !payload.as_ptr().cast::<Line>().is_aligned() {
+            return Err(payload.len());
         }
-        self.header = from.header;
+        // Read once: a peer may go on writing.
+        Ok(Self { header: *sample.user_header(), format: Arc::clone(format), sample })
     }
 
-    /// All of another but its pictures and masks, which stay what they were.
-    pub fn copy_numbers(&mut self, from: &Self) {
+    #[must_use]
+    pub fn view(&self) -> Observation<'_> {
+        Observation { header: &self.header, format: &self.format, payload: self.sample.payload() }
+    }
+
+    /// Which publisher it is from.
+    #[must_use]
+    pub fn origin(&self) -> u128 {
+        self.sample.origin().value()
+    }
+}
+
+impl Deref for ObservationSample {
+    type Target = ObservationHeader;
+    fn deref(&self) -> &ObservationHeader {
+        &self.header
+    }
+}
+
+/// An observation with memory of its own.
+#[derive(Debug, PartialEq)]
+pub struct OwnedObservation {
+    header: ObservationHeader,
+    format: Arc<Format>,
+    payload: Vec<Line>,
+}
+
+impl Deref for OwnedObservation {
+    type Target = ObservationHeader;
+    fn deref(&self) -> &ObservationHeader {
+        &self.header
+    }
+}
+
+impl DerefMut for OwnedObservation {
+    fn deref_mut(&mut self) -> &mut ObservationHeader {
+        &mut self.header
+    }
+}
+
+impl From<Observation<'_>> for OwnedObservation {
+    fn from(from: Observation<'_>) -> Self {
+        let mut copy = Self::zeroed(from.format);
+        copy.copy(&from);
+        copy
+    }
+}
+
+impl Clone for OwnedObservation {
+    fn clone(&self) -> Self {
+        self.view().into()
+    }
+}
+
+impl OwnedObservation {
+    /// An observation of zeros.
+    #[must_use]
+    pub fn zeroed(format: &Arc<Format>) -> Self {
+        let lines = format.layout().observation_bytes / size_of::<Line>();
+        let payload = vec![Line([0; 64]); lines];
+        Self { header: ObservationHeader::zeroed(), format: Arc::clone(format), payload }
+    }
+
+    #[must_use]
+    pub fn view(&self) -> Observation<'_> {
+        Observation { header: &self.header, format: &self.format, payload: cast_slice(&self.payload) }
+    }
+
+    pub fn edit(&mut self) -> ObservationMut<'_> {
+        let payload = cast_slice_mut(&mut self.payload);
+        ObservationMut { header: &mut self.header, format: &self.format, payload }
+    }
+
+    /// Takes another over; allocates nothing where both are of one format.
+    pub fn copy(&mut self, from: &Observation<'_>) {
+        self.take_header(from);
+        self.edit().payload.copy_from_slice(from.payload);
+    }
+
+    /// The same but for its pictures and masks, which stay what they were.
+    pub fn copy_numbers(&mut self, from: &Observation<'_>) {
         self.take_header(from);
         let end = self.format.layout().executed.bytes.end;
-        self.edit().payload[..end].copy_from_slice(&from.payload()[..end]);
+        self.edit().payload[..end].copy_from_slice(&from.payload[..end]);
     }
 
-    /// To write into it. One that was received becomes a copy.
-    pub fn edit(&mut self) -> ObservationMut<'_> {
-        if let Payload::Shared(sample) = &self.payload {
-            let mut lines = vec![Line([0; 64]); sample.payload().len() / size_of::<Line>()];
-            cast_slice_mut(&mut lines).copy_from_slice(sample.payload());
-            self.payload = Payload::Own(lines);
+    fn take_header(&mut self, from: &Observation<'_>) {
+        if !Arc::ptr_eq(&self.format, from.format) {
+            *self = Self::zeroed(from.format);
         }
-        let payload = match &mut self.payload {
-            Payload::Own(lines) => cast_slice_mut(lines),
-            // Replaced above.
-            Payload::Shared(_) => &mut [],
-        };
-        ObservationMut { header: &mut self.header, format: &self.format, payload }
+        self.header = *from.header;
     }
 }
 
@@ -239,9 +266,9 @@ impl ObservationMut<'_> {
     }
 
     /// All of another of the same format, its header too.
-    pub fn copy(&mut self, from: &Observation) {
-        *self.header = from.header;
-        self.payload.copy_from_slice(from.payload());
+    pub fn copy(&mut self, from: &Observation<'_>) {
+        *self.header = *from.header;
+        self.payload.copy_from_slice(from.payload);
     }
 }
 
@@ -251,40 +278,40 @@ mod tests {
 
     #[test]
     fn a_non_finite_observation_is_seen() {
-        let mut observation = Observation::zeroed(&Format::metaworld());
-        assert!(observation.is_finite());
+        let mut observation = OwnedObservation::zeroed(&Format::metaworld());
+        assert!(observation.view().is_finite());
         observation.edit().state()[17] = f32::NAN;
-        assert!(!observation.is_finite() && !observation.is_valid());
+        assert!(!observation.view().is_finite() && !observation.view().is_valid());
     }
 
     #[test]
     fn an_executed_action_out_of_range_makes_an_observation_invalid() {
-        let mut observation = Observation::zeroed(&Format::metaworld());
+        let mut observation = OwnedObservation::zeroed(&Format::metaworld());
         for (executed, valid) in
             [(-1.0, true), (1.0 + f32::EPSILON, true), (1.1, false), (-3e38, false), (f32::NAN, false)]
         {
             observation.edit().executed()[2] = executed;
-            assert_eq!(observation.is_valid(), valid, "{executed}");
+            assert_eq!(observation.view().is_valid(), valid, "{executed}");
         }
     }
 
     #[test]
     fn blocks_do_not_meet_and_a_copy_of_numbers_leaves_pictures() {
         let format = Format::metaworld();
-        let (mut from, mut to) = (Observation::zeroed(&format), Observation::zeroed(&format));
+        let (mut from, mut to) = (OwnedObservation::zeroed(&format), OwnedObservation::zeroed(&format));
         let mut edited = from.edit();
         edited.sequence = 3;
         edited.state().fill(1.0);
         edited.executed().fill(0.5);
         edited.image(0).fill(7);
         edited.mask(0).unwrap().fill(255);
-        assert!(from.mask(0).is_none(), "no flag says that there is one");
+        assert!(from.view().mask(0).is_none(), "no flag says that there is one");
         from.flags = super::super::ObservationFlags::MASK_VALID.0;
-        assert!(from.mask(0).unwrap().iter().all(|pixel| *pixel == 255));
-        to.copy_numbers(&from);
-        assert!(to.state() == from.state() && to.executed() == from.executed() && to.sequence == 3);
-        assert!(to.image(0).iter().all(|byte| *byte == 0));
-        to.clone_from(&from);
+        assert!(from.view().mask(0).unwrap().iter().all(|pixel| *pixel == 255));
+        to.copy_numbers(&from.view());
+        assert!(to.view().state() == from.view().state() && to.view().executed() == from.view().executed() && to.sequence == 3);
+        assert!(to.view().image(0).iter().all(|byte| *byte == 0));
+        to.copy(&from.view());
         assert_eq!(to, from);
     }
 }

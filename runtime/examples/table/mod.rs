@@ -15,7 +15,7 @@ impl Table {
     }
 
     /// Moves, and gives what was executed: the fingers of this hand do not move.
-    pub fn step(&mut self, action: [f32; ACTION_LEN]) -> [f32; ACTION_LEN] {
+    pub fn step(&mut self, action: ActionValues) -> ActionValues {
         for (place, velocity) in self.hand.iter_mut().zip(action) {
             *place = (*place + 0.02 * velocity).clamp(0.0, 1.0);
         }

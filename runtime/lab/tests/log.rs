@@ -361,7 +361,6 @@ impl CallLog {
             answers: u64::from(step),
             published_ns: 2,
             source,
-            reserved: 0,
             action: action.unwrap(),
         };
         let (telemetry, counters) = (Telemetry::new(), Counters::default());

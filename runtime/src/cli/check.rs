@@ -44,8 +44,6 @@ struct Report<'a> {
     action_bytes: usize,
     bundle: Option<&'a Path>,
     fits: Option<bool>,
-    /// What a bundle of this version lets be compared.
-    compared: &'static [&'static str],
     mismatches: &'a [Mismatch],
 }
 
@@ -53,7 +51,7 @@ pub(super) fn run(arguments: &CheckArguments) -> anyhow::Result<()> {
     shared::prepare_json(arguments.json.as_deref())?;
     let robot = read(&arguments.robot)?;
     let bundle = arguments.bundle.as_deref().map(shared::open_bundle).transpose()?;
-    let mismatches = bundle.as_ref().map(|bundle| bundle.manifest.control.mismatches(&robot));
+    let mismatches = bundle.as_ref().map(|bundle| bundle.manifest.mismatches(&robot));
     let layout = Layout::of(&robot);
     let report = Report {
         robot: &arguments.robot,
@@ -63,17 +61,13 @@ pub(super) fn run(arguments: &CheckArguments) -> anyhow::Result<()> {
         action_bytes: layout.action_bytes,
         bundle: arguments.bundle.as_deref(),
         fits: mismatches.as_ref().map(Vec::is_empty),
-        compared: &["camera size", "rate", "action mode", "action elements", "action limits"],
         mismatches: mismatches.as_deref().unwrap_or_default(),
     };
     shared::write_json(arguments.json.as_deref(), &report)?;
     describe(&robot, &report);
     let (Some(folder), Some(found)) = (&arguments.bundle, &mismatches) else { return Ok(()) };
     if found.is_empty() {
-        rcwm_models::outln!("fits {} in sizes, rate, mode and limits", folder.display());
-        rcwm_models::outln!(
-            "names, kinds, units and states are not compared: bundles of version 1 have none"
-        );
+        rcwm_models::outln!("fits {}", folder.display());
         return Ok(());
     }
     for mismatch in found {

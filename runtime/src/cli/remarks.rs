@@ -2,7 +2,7 @@
 
 use rcwm_models::bundle::Manifest;
 use rcwm_models::tasks::{OWN_TASK, task_name};
-use rcwm_models::wire::Observation;
+use rcwm_models::wire::ObservationHeader;
 
 use crate::controller::Counters;
 use crate::record::Record;
@@ -42,7 +42,7 @@ impl Remarks {
             (self.task, self.period_ns) = (None, 0);
         }
         if record.observed {
-            self.look(&record.observation, &manifest.task, manifest.control.rate_hz);
+            self.look(&record.observation, &manifest.task, manifest.interface.rate_hz);
         }
         self.lateness(&record.counters);
         let new = self.told;
@@ -55,7 +55,7 @@ impl Remarks {
         std::mem::take(&mut self.made)
     }
 
-    fn look(&mut self, observation: &Observation, task: &str, rate_hz: f64) {
+    fn look(&mut self, observation: &ObservationHeader, task: &str, rate_hz: f64) {
         if self.task != Some(observation.task) {
             self.task = Some(observation.task);
             let found = task_name(observation.task);
@@ -78,8 +78,8 @@ impl Remarks {
     }
 
     /// Whether ticks of the robot's clock are skipped.
-    fn pace(&mut self, observation: &Observation) {
-        let &Observation { episode, sequence, scheduled_ns, period_ns, .. } = observation;
+    fn pace(&mut self, observation: &ObservationHeader) {
+        let &ObservationHeader { episode, sequence, scheduled_ns, period_ns, .. } = observation;
         if period_ns == 0 || self.slow_told {
             return;
         }
@@ -136,13 +136,13 @@ mod tests {
 
     use super::*;
 
-    fn observation(sequence: u64, scheduled_ns: u64) -> Observation {
-        Observation {
+    fn observation(sequence: u64, scheduled_ns: u64) -> ObservationHeader {
+        ObservationHeader {
             sequence,
             scheduled_ns,
             period_ns: 25_000_000,
             task: task_id("reach").unwrap(),
-            ..Observation::zeroed()
+            ..ObservationHeader::zeroed()
         }
     }
 
@@ -152,9 +152,9 @@ mod tests {
         for tick in 0..100 {
             remarks.look(&observation(tick, tick * 25_000_000), "reach", 40.0);
         }
-        let lockstep = Observation { period_ns: 0, ..observation(0, 0) };
+        let lockstep = ObservationHeader { period_ns: 0, ..observation(0, 0) };
         remarks.look(&lockstep, "reach", 40.0);
-        remarks.look(&Observation { task: OWN_TASK, ..lockstep }, "hammer", 40.0);
+        remarks.look(&ObservationHeader { task: OWN_TASK, ..lockstep }, "hammer", 40.0);
         remarks.look(&lockstep, "own", 40.0);
         assert_eq!(remarks.take(), Vec::<String>::new());
     }
@@ -195,7 +195,7 @@ mod tests {
             let pause = if tick < 30 { 0 } else { 10_000_000_000 };
             let episode = tick / 30;
             remarks.look(
-                &Observation { episode, ..observation(tick, tick * 25_000_000 + pause) },
+                &ObservationHeader { episode, ..observation(tick, tick * 25_000_000 + pause) },
                 "reach",
                 40.0,
             );

@@ -156,8 +156,8 @@ impl RunArguments {
         engine: EngineSettings,
         sampling: Sampling,
     ) -> Result<Swapper, String> {
-        let (link, rate_hz) = (LinkSettings::new(&self.instance), bundle.manifest.control.rate_hz);
-        Swapper::start(SwapSettings { link, engine, sampling, rate_hz }).map_err(|error| error.to_string())
+        let (link, interface) = (LinkSettings::new(&self.instance), bundle.manifest.interface.clone());
+        Swapper::start(SwapSettings { link, engine, sampling, interface }).map_err(|error| error.to_string())
     }
 
     fn controller_settings(&self) -> ControllerSettings {

@@ -32,6 +32,9 @@ pub enum ControllerError {
          --fallback hold, or name a pose as four numbers"
     )]
     ZeroIsAPose,
+    /// The pose to fall back to has another count of numbers than the policy's actions.
+    #[error("--fallback names {found} numbers, the bundle's actions have {expected}")]
+    FallbackNumbers { found: usize, expected: usize },
     /// The peer was there and has been silent for too long.
     #[error(
         "the peer on instance {instance:?} has been silent for {silence_s} s; look after it, or wait longer with \
@@ -81,6 +84,7 @@ impl From<&ControllerError> for Ended {
             ControllerError::Link(_)
             | ControllerError::NoObservation { .. }
             | ControllerError::Panicked(_)
+            | ControllerError::FallbackNumbers { .. }
             | ControllerError::ZeroIsAPose => Self::Failed,
         }
     }

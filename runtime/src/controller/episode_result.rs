@@ -1,7 +1,7 @@
 //! One episode, as the report tells it.
 
 use rcwm_models::tasks::task_name;
-use rcwm_models::wire::{Observation, ObservationFlags};
+use rcwm_models::wire::{ObservationHeader, ObservationFlags};
 use serde::Serialize;
 
 #[derive(Debug, Clone, Copy, PartialEq, Serialize)]
@@ -25,7 +25,7 @@ pub struct EpisodeResult {
 impl EpisodeResult {
     /// An episode that begins with this observation, which is not counted yet.
     #[must_use]
-    pub fn start(observation: &Observation) -> Self {
+    pub fn start(observation: &ObservationHeader) -> Self {
         Self {
             episode: observation.episode,
             task: task_name(observation.task),
@@ -38,7 +38,7 @@ impl EpisodeResult {
     }
 
     /// Counts an observation.
-    pub fn add(&mut self, observation: &Observation) {
+    pub fn add(&mut self, observation: &ObservationHeader) {
         self.steps = observation.step;
         self.success |= observation.is(ObservationFlags::SUCCESS);
         if observation.reward.is_finite() {

@@ -77,7 +77,7 @@ impl Episodes {
 
 #[cfg(test)]
 mod tests {
-    use rcwm_models::wire::Observation;
+    use rcwm_models::wire::ObservationHeader;
 
     use super::*;
 
@@ -87,7 +87,7 @@ mod tests {
         let capacity = episodes.last.capacity();
         let count = 3 * EPISODES_KEPT as u64;
         for number in 0..count {
-            let start = EpisodeResult::start(&Observation::zeroed());
+            let start = EpisodeResult::start(&ObservationHeader::zeroed());
             let (whole, success) = (number % 2 == 0, number % 4 == 0);
             episodes.push(EpisodeResult { episode: number, return_sum: 2.0, whole, success, ..start });
         }

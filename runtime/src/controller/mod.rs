@@ -44,7 +44,6 @@ pub use transport::Transport;
 use std::sync::atomic::{AtomicBool, Ordering};
 use std::time::Duration;
 
-use rcwm_models::bundle::ActionMode;
 use rcwm_models::wire::{Action, ControllerLink, ObservationSample, Wait};
 
 use crate::pacing::{Pacing, Plan};
@@ -116,7 +115,8 @@ impl Controller {
     pub fn open(policy: Policy, settings: ControllerSettings) -> Result<Self, ControllerError> {
         // What is wrong with the settings is said before anybody is connected to.
         let filter = safety_filter(&policy, &settings)?;
-        let link = ControllerLink::open(settings.link.clone())?;
+        let manifest = policy.manifest().clone();
+        let link = ControllerLink::open(settings.link.clone(), move |robot| manifest.mismatches(robot))?;
         Ok(Self::with(Box::new(link), filter, policy, settings))
     }
 
@@ -174,7 +174,7 @@ impl Controller {
         if let Some(swapper) = &self.swapper
             && swapper.poll(moment, &mut self.policy)
         {
-            self.filter.take_limits(&self.policy.manifest().control);
+            self.filter.take_limits(self.policy.limits());
             self.imagined.clear();
             self.fresh_policy = true;
             self.counters.swaps += 1;
@@ -372,9 +372,15 @@ impl Controller {
 
 /// The safety filter of a policy under these settings.
 fn safety_filter(policy: &Policy, settings: &ControllerSettings) -> Result<SafetyFilter, ControllerError> {
-    let control = &policy.manifest().control;
-    if settings.fallback == Fallback::Zero && control.action_mode == ActionMode::Absolute {
-        return Err(ControllerError::ZeroIsAPose);
+    let limits = policy.limits();
+    let all_are_positions = (0..limits.numbers()).all(|at| limits.is_absolute(at));
+    match settings.fallback {
+        Fallback::Zero if all_are_positions => return Err(ControllerError::ZeroIsAPose),
+        Fallback::Given(action) if action.len() != limits.numbers() => {
+            let (found, expected) = (action.len(), limits.numbers());
+            return Err(ControllerError::FallbackNumbers { found, expected });
+        }
+        _ => {}
     }
-    Ok(SafetyFilter::new(control, settings.rate_max))
+    Ok(SafetyFilter::new(limits, settings.rate_max))
 }

@@ -2,9 +2,7 @@
 
 use std::str::FromStr;
 
-use rcwm_models::ACTION_LEN;
-use rcwm_models::bundle::{ActionMode, Control};
-use rcwm_models::wire::{Observation, ObservationFlags};
+use rcwm_models::wire::{ActionValues, Observation, ObservationFlags};
 use serde::{Deserialize, Serialize};
 
 use crate::policy::ActionLimits;
@@ -18,7 +16,7 @@ pub enum Fallback {
     /// Zeros: no motion where actions are displacements or velocities, the gripper half closed. Holds where they are positions.
     Zero,
     /// This action.
-    Given([f32; ACTION_LEN]),
+    Given(ActionValues),
 }
 
 impl FromStr for Fallback {
@@ -31,10 +29,9 @@ impl FromStr for Fallback {
             _ => {}
         }
         let values: Result<Vec<f32>, _> = text.split(',').map(|value| value.trim().parse()).collect();
-        let action: Option<[f32; ACTION_LEN]> = values.ok().and_then(|values| values.try_into().ok());
-        match action {
-            Some(action) if action.iter().all(|x| x.is_finite()) => Ok(Self::Given(action)),
-            _ => Err(format!("expected hold, zero, or {ACTION_LEN} finite numbers as in 0,0,0,-1")),
+        match values.ok().and_then(|values| ActionValues::of(&values)) {
+            Some(action) if action.is_finite() => Ok(Self::Given(action)),
+            _ => Err("expected hold, zero, or the finite numbers of an action as in 0,0,0,-1".into()),
         }
     }
 }
@@ -43,7 +40,7 @@ impl FromStr for Fallback {
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct Passed {
     /// The action, fit to be sent.
-    pub action: [f32; ACTION_LEN],
+    pub action: ActionValues,
     /// It was not finite, and is the held action instead.
     pub was_not_finite: bool,
     /// The rate limit has changed it.
@@ -54,38 +51,32 @@ pub struct Passed {
 #[derive(Debug, Clone, Copy)]
 pub struct SafetyFilter {
     limits: ActionLimits,
-    mode: ActionMode,
+    /// Beside that of the limits.
     rate_max: Option<f32>,
     /// What the robot executes as far as is known: executed as the last observation says, or sent since.
-    held: Option<[f32; ACTION_LEN]>,
+    held: Option<ActionValues>,
     /// What was sent last in this episode.
-    sent: Option<[f32; ACTION_LEN]>,
+    sent: Option<ActionValues>,
 }
 
 impl SafetyFilter {
     /// A safety filter with the limits of a bundle; with `rate_max`, no component moves by more than that from what was executed last.
     #[must_use]
-    pub fn new(control: &Control, rate_max: Option<f32>) -> Self {
+    pub fn new(limits: ActionLimits, rate_max: Option<f32>) -> Self {
         // Written so that NaN allows no motion.
         let rate_max = rate_max.map(|rate_max| rate_max.max(0.0));
-        Self {
-            limits: ActionLimits::of(control),
-            mode: control.action_mode,
-            rate_max,
-            held: None,
-            sent: None,
-        }
+        Self { limits, rate_max, held: None, sent: None }
     }
 
     /// Another policy, with limits of its own. What was executed and sent was executed and sent.
-    pub fn take_limits(&mut self, control: &Control) {
-        (self.limits, self.mode) = (ActionLimits::of(control), control.action_mode);
+    pub fn take_limits(&mut self, limits: ActionLimits) {
+        self.limits = limits;
     }
 
     /// A new observation, the first of an episode or where the controller joined one: takes over what the robot has executed. An
     /// observation that is refused tells nothing, unless nothing else is known.
-    pub fn observed(&mut self, observation: &Observation, is_first: bool) {
-        let absolute = self.mode == ActionMode::Absolute;
+    pub fn observed(&mut self, observation: &Observation<'_>, is_first: bool) {
+        let absolute = self.limits.absolute != 0;
         if is_first {
             self.sent = None;
             if !absolute && observation.is(ObservationFlags::FIRST) {
@@ -94,10 +85,10 @@ impl SafetyFilter {
                 self.held = None;
             }
         }
-        let executed = observation.executed_action;
+        let executed = observation.executed_action();
         // Zeros at a first observation say that nothing was executed, which is no position.
         let says_nothing =
-            absolute && observation.is(ObservationFlags::FIRST) && executed == [0.0; ACTION_LEN];
+            absolute && observation.is(ObservationFlags::FIRST) && executed.iter().all(|x| *x == 0.0);
         if observation.is_valid() || (self.held.is_none() && observation.has_executable_action()) {
             self.held = if says_nothing { self.held } else { Some(executed) };
         }
@@ -106,24 +97,27 @@ impl SafetyFilter {
     /// What the robot goes on with when nothing else is sent: what it executed last. Before anything is known, no motion; none where
     /// zeros are not that.
     #[must_use]
-    pub fn held(&self) -> Option<[f32; ACTION_LEN]> {
-        let rest = (self.mode != ActionMode::Absolute).then_some([0.0; ACTION_LEN]);
+    pub fn held(&self) -> Option<ActionValues> {
+        let rest = (self.limits.absolute == 0).then(|| ActionValues::zeros(self.limits.numbers()));
         self.held.or(rest)
     }
 
     /// The fallback's action; none where there is nothing to hold.
     #[must_use]
-    pub fn fallback(&self, fallback: Fallback) -> Option<[f32; ACTION_LEN]> {
+    pub fn fallback(&self, fallback: Fallback) -> Option<ActionValues> {
         match fallback {
-            Fallback::Zero if self.mode != ActionMode::Absolute => Some([0.0; ACTION_LEN]),
-            Fallback::Hold | Fallback::Zero => self.held(),
+            Fallback::Hold => self.held(),
+            Fallback::Zero => self.held().map(|held| {
+                let rest = |i: usize| if self.limits.is_absolute(i) { held[i] } else { 0.0 };
+                ActionValues::from_fn(held.len(), rest)
+            }),
             Fallback::Given(action) => Some(action),
         }
     }
 
     /// The action that may be sent in place of `action`; none where it is not finite and there is nothing to hold.
     #[must_use]
-    pub fn pass(&self, action: [f32; ACTION_LEN]) -> Option<Passed> {
+    pub fn pass(&self, action: ActionValues) -> Option<Passed> {
         let was_not_finite = action.iter().any(|x| !x.is_finite());
         let wanted = if was_not_finite { self.held()? } else { action };
         let limited = self.limit_rate(wanted);
@@ -132,11 +126,15 @@ impl SafetyFilter {
         Some(Passed { action, was_not_finite, rate_limited: limited != wanted })
     }
 
-    fn limit_rate(&self, action: [f32; ACTION_LEN]) -> [f32; ACTION_LEN] {
-        let (Some(rate_max), Some(held)) = (self.rate_max, self.held()) else { return action };
+    fn limit_rate(&self, action: ActionValues) -> ActionValues {
+        let Some(held) = self.held() else { return action };
         // What was sent last may be executed only after the observation that is answered now: near it too, where that is possible.
         let sent = self.sent.unwrap_or(held);
-        std::array::from_fn(|i| {
+        ActionValues::from_fn(action.len(), |i| {
+            let rate_max = self.limits.rate_max[i].min(self.rate_max.unwrap_or(f32::INFINITY));
+            if rate_max == f32::INFINITY {
+                return action[i];
+            }
             let (low, high) = (held[i] - rate_max, held[i] + rate_max);
             let (low_of_both, high_of_both) = (low.max(sent[i] - rate_max), high.min(sent[i] + rate_max));
             if low_of_both <= high_of_both {
@@ -148,7 +146,7 @@ impl SafetyFilter {
     }
 
     /// The action was sent.
-    pub fn sent(&mut self, action: [f32; ACTION_LEN]) {
+    pub fn sent(&mut self, action: ActionValues) {
         (self.held, self.sent) = (Some(action), Some(action));
     }
 }
@@ -157,100 +155,99 @@ impl SafetyFilter {
 mod tests {
     use super::*;
 
-    const LOW: [f32; ACTION_LEN] = [-1.0, -1.0, 0.2, -1.0];
-    const HIGH: [f32; ACTION_LEN] = [1.0, 0.5, 1.0, 1.0];
+    const LOW: [f32; 4] = [-1.0, -1.0, 0.2, -1.0];
+    const HIGH: [f32; 4] = [1.0, 0.5, 1.0, 1.0];
 
-    fn control(mode: ActionMode) -> Control {
-        Control { rate_hz: 40.0, action_low: LOW, action_high: HIGH, action_mode: mode }
+    fn limits(absolute: bool) -> ActionLimits {
+        let rate_max = [f32::INFINITY; 4].into();
+        ActionLimits { low: LOW.into(), high: HIGH.into(), rate_max, absolute: if absolute { 0b1111 } else { 0 } }
     }
 
     fn safety_filter(rate_max: Option<f32>) -> SafetyFilter {
-        SafetyFilter::new(&control(ActionMode::Delta), rate_max)
+        SafetyFilter::new(limits(false), rate_max)
     }
 
-    fn send(filter: &mut SafetyFilter, action: [f32; ACTION_LEN]) -> Passed {
-        let passed = filter.pass(action).unwrap();
+    fn send(filter: &mut SafetyFilter, action: [f32; 4]) -> Passed {
+        let passed = filter.pass(action.into()).unwrap();
         filter.sent(passed.action);
         passed
     }
 
-    fn executed(action: [f32; ACTION_LEN]) -> Observation {
-        let mut observation = Observation::zeroed();
-        observation.executed_action = action;
+    fn executed(action: [f32; 4]) -> Observation {
+        let mut observation = Observation::zeroed(&Format::metaworld());
+        observation.edit().executed().copy_from_slice(&action);
         observation
     }
 
-    fn first(action: [f32; ACTION_LEN]) -> Observation {
+    fn first(action: [f32; 4]) -> Observation {
         let mut observation = executed(action);
         observation.flags = ObservationFlags::FIRST.0;
         observation
     }
 
-    fn assert_near(passed: Option<Passed>, expected: [f32; ACTION_LEN]) {
+    fn assert_near(passed: Option<Passed>, expected: [f32; 4]) {
         let found = passed.unwrap().action;
         assert!(found.iter().zip(expected).all(|(a, b)| (a - b).abs() < 1e-6), "{found:?}, not {expected:?}");
     }
 
-    fn within_limits(action: [f32; ACTION_LEN]) -> bool {
-        (0..ACTION_LEN).all(|i| (LOW[i]..=HIGH[i]).contains(&action[i]))
+    fn within_limits(action: ActionValues) -> bool {
+        (0..4).all(|i| (LOW[i]..=HIGH[i]).contains(&action[i]))
     }
 
     #[test]
     fn what_is_not_finite_becomes_what_was_executed_last() {
-        for mode in [ActionMode::Delta, ActionMode::Velocity, ActionMode::Absolute] {
-            let mut filter = SafetyFilter::new(&control(mode), None);
+        for absolute in [false, true] {
+            let mut filter = SafetyFilter::new(limits(absolute), None);
             filter.observed(&executed([0.4, -0.3, 0.5, 0.9]), true);
             for bad in [f32::NAN, f32::INFINITY, f32::NEG_INFINITY] {
-                let passed = filter.pass([0.5, bad, 0.5, 0.5]).unwrap();
+                let passed = filter.pass([0.5, bad, 0.5, 0.5].into()).unwrap();
                 assert_eq!((passed.action, passed.was_not_finite), ([0.4, -0.3, 0.5, 0.9], true));
             }
-            assert!(!filter.pass([9.0; 4]).unwrap().was_not_finite);
+            assert!(!filter.pass([9.0; 4].into()).unwrap().was_not_finite);
             send(&mut filter, [0.1, 0.2, 0.3, 0.4]);
-            assert_eq!(filter.pass([f32::NAN; 4]).unwrap().action, [0.1, 0.2, 0.3, 0.4]);
+            assert_eq!(filter.pass([f32::NAN; 4].into()).unwrap().action, [0.1, 0.2, 0.3, 0.4]);
         }
     }
 
     #[test]
     fn before_anything_is_known_displacements_rest_and_positions_are_not_invented() {
-        for mode in [ActionMode::Delta, ActionMode::Velocity] {
-            let filter = SafetyFilter::new(&control(mode), Some(0.1));
-            assert_eq!(filter.fallback(Fallback::Hold), Some([0.0; 4]));
-            assert_eq!(filter.pass([f32::NAN; 4]).unwrap().action, [0.0, 0.0, 0.2, 0.0]);
-        }
-        let mut filter = SafetyFilter::new(&control(ActionMode::Absolute), Some(0.1));
+        let filter = SafetyFilter::new(limits(false), Some(0.1));
+        assert_eq!(filter.fallback(Fallback::Hold).unwrap(), [0.0; 4]);
+        assert_eq!(filter.pass([f32::NAN; 4].into()).unwrap().action, [0.0, 0.0, 0.2, 0.0]);
+        let mut filter = SafetyFilter::new(limits(true), Some(0.1));
         filter.observed(&first([0.0; 4]), true);
-        let nothing = filter.pass([f32::NAN; 4]).is_none();
+        let nothing = filter.pass([f32::NAN; 4].into()).is_none();
         assert!(
             nothing && filter.fallback(Fallback::Hold).is_none() && filter.fallback(Fallback::Zero).is_none()
         );
         // Nothing tells how far the policy's position is from the robot's.
-        assert_eq!(filter.pass([0.9, 0.4, 0.9, 0.9]).unwrap().action, [0.9, 0.4, 0.9, 0.9]);
+        assert_eq!(filter.pass([0.9, 0.4, 0.9, 0.9].into()).unwrap().action, [0.9, 0.4, 0.9, 0.9]);
     }
 
     #[test]
     fn a_position_is_held_across_the_start_of_an_episode_and_a_motion_is_not() {
-        for (mode, held) in [(ActionMode::Absolute, [0.7; 4]), (ActionMode::Delta, [0.0; 4])] {
-            let mut filter = SafetyFilter::new(&control(mode), None);
+        for (absolute, held) in [(true, [0.7; 4]), (false, [0.0; 4])] {
+            let mut filter = SafetyFilter::new(limits(absolute), None);
             filter.observed(&executed([0.7; 4]), true);
             filter.observed(&first([0.0; 4]), true);
-            assert_eq!(filter.held(), Some(held), "{mode:?}");
-            assert_eq!(filter.fallback(Fallback::Zero), Some(held), "{mode:?}");
+            assert_eq!(filter.held(), Some(held.into()), "absolute {absolute}");
+            assert_eq!(filter.fallback(Fallback::Zero), Some(held.into()), "absolute {absolute}");
             // A robot that says where it stands is believed.
             filter.observed(&first([0.3; 4]), true);
-            assert_eq!(filter.held(), Some([0.3; 4]), "{mode:?}");
+            assert_eq!(filter.held(), Some([0.3; 4].into()), "absolute {absolute}");
         }
     }
 
     #[test]
     fn a_robot_that_does_not_say_that_it_starts_is_not_taken_to_rest() {
         let mut filter = safety_filter(Some(0.1));
-        filter.sent([0.4; 4]);
+        filter.sent([0.4; 4].into());
         // Another episode or another publisher, whose first observation never came, with numbers that are none.
         filter.observed(&executed([f32::NAN; 4]), true);
-        assert_eq!(filter.fallback(Fallback::Hold), Some([0.4; 4]));
-        assert_near(filter.pass([-1.0; 4]), [0.3; 4]);
+        assert_eq!(filter.fallback(Fallback::Hold), Some([0.4; 4].into()));
+        assert_near(filter.pass([-1.0; 4].into()), [0.3; 4]);
         filter.observed(&first([0.0; 4]), true);
-        assert_eq!(filter.fallback(Fallback::Hold), Some([0.0; 4]));
+        assert_eq!(filter.fallback(Fallback::Hold), Some([0.0; 4].into()));
     }
 
     #[test]
@@ -259,24 +256,24 @@ mod tests {
         refused.reward = f32::NAN;
         let mut filter = safety_filter(None);
         filter.observed(&refused, true);
-        assert_eq!(filter.held(), Some([0.6; 4]));
-        filter.sent([0.1; 4]);
+        assert_eq!(filter.held(), Some([0.6; 4].into()));
+        filter.sent([0.1; 4].into());
         for bad in [0.8, 3e38, f32::NAN] {
-            refused.executed_action = [bad; 4];
+            refused.edit().executed().fill(bad);
             filter.observed(&refused, false);
-            assert_eq!(filter.held(), Some([0.1; 4]), "{bad}");
+            assert_eq!(filter.held(), Some([0.1; 4].into()), "{bad}");
         }
         filter.observed(&executed([3e38; 4]), false);
-        assert_eq!(filter.held(), Some([0.1; 4]));
+        assert_eq!(filter.held(), Some([0.1; 4].into()));
     }
 
     #[test]
     fn no_component_moves_faster_than_the_rate_limit_and_all_stay_within_the_limits() {
         let mut filter = safety_filter(Some(0.3));
-        let mut last = [0.0; 4];
+        let mut last = ActionValues::zeros(4);
         for wanted in [[9.0; 4], [9.0; 4], [-9.0; 4], [f32::NAN; 4], [-9.0; 4], [0.1, 0.1, 0.3, 0.1]] {
             let action = send(&mut filter, wanted).action;
-            let near = action.iter().zip(last).all(|(a, b)| (a - b).abs() <= 0.3 + 1e-6);
+            let near = action.iter().zip(last.iter()).all(|(a, b)| (a - b).abs() <= 0.3 + 1e-6);
             assert!(near && within_limits(action), "{action:?} after {last:?}");
             last = action;
         }
@@ -285,11 +282,10 @@ mod tests {
     #[test]
     fn limits_come_last_even_where_another_policy_has_narrower_ones_than_what_was_sent() {
         let mut filter = safety_filter(Some(0.1));
-        filter.sent([0.9, 0.5, 0.9, -0.9]);
-        let control = Control { action_low: [-0.2; 4], action_high: [0.2; 4], ..control(ActionMode::Delta) };
-        filter.take_limits(&control);
-        assert_eq!(filter.pass([1.0, 1.0, 1.0, -1.0]).unwrap().action, [0.2, 0.2, 0.2, -0.2]);
-        assert_eq!(filter.pass([f32::NAN; 4]).unwrap().action, [0.2, 0.2, 0.2, -0.2]);
+        filter.sent([0.9, 0.5, 0.9, -0.9].into());
+        filter.take_limits(ActionLimits { low: [-0.2; 4].into(), high: [0.2; 4].into(), ..limits(false) });
+        assert_eq!(filter.pass([1.0, 1.0, 1.0, -1.0].into()).unwrap().action, [0.2, 0.2, 0.2, -0.2]);
+        assert_eq!(filter.pass([f32::NAN; 4].into()).unwrap().action, [0.2, 0.2, 0.2, -0.2]);
     }
 
     #[test]
@@ -297,11 +293,11 @@ mod tests {
         let mut filter = safety_filter(Some(0.1));
         // Joined in the middle of an episode.
         filter.observed(&executed([0.9, -0.9, 0.9, 0.9]), true);
-        assert_near(filter.pass([-1.0; 4]), [0.8, -1.0, 0.8, 0.8]);
+        assert_near(filter.pass([-1.0; 4].into()), [0.8, -1.0, 0.8, 0.8]);
         send(&mut filter, [0.9, -0.9, 0.9, 0.9]);
         // What was sent was not executed.
         filter.observed(&executed([0.0, 0.0, 0.5, 0.0]), false);
-        assert_near(filter.pass([1.0; 4]), [0.1, 0.1, 0.6, 0.1]);
+        assert_near(filter.pass([1.0; 4].into()), [0.1, 0.1, 0.6, 0.1]);
     }
 
     #[test]
@@ -310,7 +306,7 @@ mod tests {
         filter.observed(&first([0.0; 4]), true);
         send(&mut filter, [1.0; 4]);
         filter.observed(&executed([0.0; 4]), false);
-        let back = filter.pass([-1.0; 4]).unwrap().action;
+        let back = filter.pass([-1.0; 4].into()).unwrap().action;
         assert!(back[0].abs() < 1e-6, "{back:?}, after 0.1 was sent");
     }
 
@@ -318,23 +314,40 @@ mod tests {
     fn an_episode_starts_from_rest_and_what_was_not_sent_does_not_count() {
         let mut filter = safety_filter(Some(0.5));
         send(&mut filter, [1.0; 4]);
-        assert_eq!(filter.pass([1.0; 4]).unwrap().action, [1.0, 0.5, 1.0, 1.0]);
-        assert_eq!(filter.held(), Some([0.5; 4]));
+        assert_eq!(filter.pass([1.0; 4].into()).unwrap().action, [1.0, 0.5, 1.0, 1.0]);
+        assert_eq!(filter.held(), Some([0.5; 4].into()));
         filter.observed(&first([0.0; 4]), true);
-        assert_eq!(filter.pass([1.0; 4]).unwrap().action, [0.5; 4]);
-        assert!(!filter.pass([0.1, 0.1, 0.3, 0.1]).unwrap().rate_limited);
+        assert_eq!(filter.pass([1.0; 4].into()).unwrap().action, [0.5; 4]);
+        assert!(!filter.pass([0.1, 0.1, 0.3, 0.1].into()).unwrap().rate_limited);
     }
 
     #[test]
     fn fallbacks_are_named_or_given() {
         let mut filter = safety_filter(None);
-        filter.sent([0.1, 0.2, 0.3, 0.4]);
+        filter.sent([0.1, 0.2, 0.3, 0.4].into());
         let action = |text: &str| filter.fallback(text.parse().unwrap()).unwrap();
         assert_eq!(action("hold"), [0.1, 0.2, 0.3, 0.4]);
         assert_eq!(action("zero"), [0.0; 4]);
         assert_eq!(action("0, 0,0.5,-1"), [0.0, 0.0, 0.5, -1.0]);
-        for bad in ["", "stop", "1,2,3", "1,2,3,4,5", "0,0,0,NaN", "0,0,0,inf"] {
+        for bad in ["", "stop", "1,,3", "0,0,0,NaN", "0,0,0,inf"] {
             assert!(bad.parse::<Fallback>().is_err(), "{bad:?}");
         }
+    }
+
+    #[test]
+    fn a_rate_limit_of_the_interface_holds_beside_the_given_one() {
+        let mut limits = limits(false);
+        limits.rate_max = [0.1, 0.5, f32::INFINITY, f32::INFINITY].into();
+        let mut filter = SafetyFilter::new(limits, Some(0.3));
+        filter.observed(&executed([0.0, 0.0, 0.5, 0.0]), true);
+        assert_near(filter.pass([1.0; 4].into()), [0.1, 0.3, 0.8, 0.3]);
+    }
+
+    #[test]
+    fn where_a_hand_moves_and_a_gripper_is_placed_zero_holds_the_gripper() {
+        let mut filter = SafetyFilter::new(ActionLimits { absolute: 0b1000, ..limits(false) }, None);
+        assert!(filter.fallback(Fallback::Zero).is_none(), "no place of the gripper is known");
+        filter.observed(&executed([0.5, 0.4, 0.3, 0.7]), true);
+        assert_eq!(filter.fallback(Fallback::Zero).unwrap(), [0.0, 0.0, 0.0, 0.7]);
     }
 }

@@ -1,15 +1,14 @@
 //! The way onto the wire: nothing that a newer observation has overtaken, nothing that has not passed the safety filter.
 
-use rcwm_models::ACTION_LEN;
-use rcwm_models::wire::{Action, ActionSource, Observation, ObservationFlags, ObservationSample};
+use rcwm_models::wire::{Action, ActionSource, ActionValues, Observation, ObservationFlags, ObservationSample};
 
 use super::{Arrival, Controller, ControllerError};
 use crate::pacing::Stamps;
 
 /// An answer that stays here.
-fn unsent(sequence: u64, source: ActionSource, action: Option<[f32; ACTION_LEN]>) -> Action {
+fn unsent(sequence: u64, source: ActionSource, action: Option<ActionValues>) -> Action {
     let action = action.unwrap_or_default();
-    Action { answers: sequence, published_ns: 0, source: source as u32, reserved: 0, action }
+    Action { answers: sequence, published_ns: 0, source: source as u32, action }
 }
 
 impl Controller {
@@ -17,7 +16,7 @@ impl Controller {
     /// where the tick's time is over, so that a tick in time loses none.
     pub(super) fn is_overtaken(
         &mut self,
-        observation: &Observation,
+        observation: &Observation<'_>,
         received_ns: u64,
     ) -> Result<bool, ControllerError> {
         let (period_ns, due_ns) = (observation.period_ns, Stamps::of(observation, received_ns).scheduled_ns);
@@ -30,11 +29,10 @@ impl Controller {
 
     /// What an observation is to those before it; one that was due too long ago is stale, whatever its number.
     pub(super) fn arrival(&self, sample: &ObservationSample, received_ns: u64) -> Arrival {
-        let observation: &Observation = sample.payload();
-        if self.pacing.is_stale(observation, received_ns) {
+        if self.pacing.is_stale(sample, received_ns) {
             return Arrival::Stale;
         }
-        self.tracker.look(sample.origin().value(), observation.sequence, observation.episode)
+        self.tracker.look(sample.origin(), sample.sequence, sample.episode)
     }
 
     /// Whether an observation that has come will get an answer of its own, however many ticks were answered without it.
@@ -53,7 +51,7 @@ impl Controller {
         overtaken: bool,
         sequence: u64,
         source: ActionSource,
-        action: Option<[f32; ACTION_LEN]>,
+        action: Option<ActionValues>,
     ) -> Result<Action, ControllerError> {
         if !overtaken {
             return self.send(sequence, source, action);
@@ -67,7 +65,7 @@ impl Controller {
         &mut self,
         sequence: u64,
         source: ActionSource,
-        action: Option<[f32; ACTION_LEN]>,
+        action: Option<ActionValues>,
     ) -> Result<Action, ControllerError> {
         let Some(passed) = action.and_then(|action| self.filter.pass(action)) else {
             self.counters.withheld_answers += 1;
@@ -80,10 +78,9 @@ impl Controller {
             answers: sequence,
             published_ns: 0,
             source: source as u32,
-            reserved: 0,
             action: passed.action,
         };
-        answer.published_ns = self.link.send(answer)?;
+        answer.published_ns = self.link.send(&answer)?;
         self.filter.sent(answer.action);
         self.answer = Some(answer);
         self.counters.answers += 1;

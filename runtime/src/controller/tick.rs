@@ -22,7 +22,7 @@ pub struct TickTimes {
 /// What happened in one tick; shown to observers after the action was sent.
 pub struct Tick<'a> {
     /// The observation, in shared memory; none where it was missing.
-    pub observation: Option<&'a Observation>,
+    pub observation: Option<&'a Observation<'a>>,
     /// Whether the policy's state started anew.
     pub is_first: bool,
     /// The state went back to before this tick was imagined, because its observation came after all.

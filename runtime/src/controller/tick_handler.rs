@@ -1,7 +1,6 @@
 //! One tick: with an observation, or without one.
 
-use rcwm_models::ACTION_LEN;
-use rcwm_models::wire::{Action, ActionSource, Observation, ObservationFlags, ObservationSample};
+use rcwm_models::wire::{Action, ActionSource, ActionValues, Observation, ObservationFlags, ObservationSample};
 
 use super::{
     Arrival, Cause, Controller, ControllerError, EpisodeResult, Event, Response, State, Taken, Tick,
@@ -13,11 +12,11 @@ use crate::swap::Moment;
 use crate::telemetry::Stage;
 
 /// What to send, and where it comes from; no action where nothing is known that could be held.
-type Chosen = (ActionSource, Option<[f32; ACTION_LEN]>);
+type Chosen = (ActionSource, Option<ActionValues>);
 
 /// A tick on its way to the observers.
 struct Ticked<'a> {
-    observation: Option<&'a Observation>,
+    observation: Option<&'a Observation<'a>>,
     is_first: bool,
     rewound: bool,
     decision: Option<Decision>,
@@ -33,14 +32,14 @@ impl Controller {
         sample: &ObservationSample,
         observers: &mut [&mut dyn TickObserver],
     ) -> Result<Taken, ControllerError> {
+        let observation = &sample.view();
         let received_ns = self.link.now_ns();
-        let observation: &Observation = sample.payload();
         self.counters.clock_ahead += u64::from(Stamps::of(observation, received_ns).ahead_ns > 0);
         if self.pacing.is_stale(observation, received_ns) {
             self.counters.note(Arrival::Stale);
             return Ok(Taken::Nothing);
         }
-        let arrival = self.tracker.place(sample.origin().value(), observation.sequence, observation.episode);
+        let arrival = self.tracker.place(sample.origin(), observation.sequence, observation.episode);
         self.counters.note(arrival);
         match arrival {
             Arrival::Stale => Ok(Taken::Nothing),
@@ -57,7 +56,7 @@ impl Controller {
     /// imagined since: our answer was lost, or overwritten by one to a tick that the peer has not reached.
     fn answer_again(
         &mut self,
-        observation: &Observation,
+        observation: &Observation<'_>,
         received_ns: u64,
     ) -> Result<Taken, ControllerError> {
         let sequence = observation.sequence;
@@ -95,7 +94,7 @@ impl Controller {
 
     fn answer_new(
         &mut self,
-        observation: &Observation,
+        observation: &Observation<'_>,
         is_first: bool,
         received_ns: u64,
         observers: &mut [&mut dyn TickObserver],
@@ -147,15 +146,16 @@ impl Controller {
     }
 
     /// The policy's decision, and whether it is fit to be sent.
-    fn decide(&mut self, observation: &Observation, is_first: bool) -> (Option<Decision>, Event) {
-        if !observation.is_valid() {
+    fn decide(&mut self, observation: &Observation<'_>, is_first: bool) -> (Option<Decision>, Event) {
+        let camera = self.policy.camera(observation.format().interface());
+        let Some(camera) = camera.filter(|_| observation.is_valid()) else {
             self.counters.refused_observations += 1;
             return (None, Event::Invalid(Cause::Observation));
-        }
+        };
         // A new policy starts where it takes over, as at the first of an episode.
         let is_first = is_first | std::mem::take(&mut self.fresh_policy);
-        let decided =
-            self.policy.observe(&observation.image, (!is_first).then_some(&observation.executed_action));
+        let executed = observation.executed_action();
+        let decided = self.policy.observe(observation.image(camera), (!is_first).then_some(&executed));
         let decision = match decided {
             Ok(decision) => decision,
             Err(error) => return (None, Event::Invalid(self.count_failure(&error))),
@@ -263,7 +263,7 @@ impl Controller {
     fn imagine(
         &mut self,
         sequence: u64,
-        held: &[f32; ACTION_LEN],
+        held: &ActionValues,
     ) -> Result<(Option<Decision>, Chosen), ControllerError> {
         self.imagined.note(sequence, self.policy.state());
         match self.policy.imagine(held) {
@@ -277,7 +277,7 @@ impl Controller {
     }
 
     /// In the idle time: all of the next tick that needs only the action. What fails here fails again, and is counted, in the tick.
-    fn work_ahead(&mut self, action: Option<&[f32; ACTION_LEN]>) {
+    fn work_ahead(&mut self, action: Option<&ActionValues>) {
         let start_ns = self.link.now_ns();
         // See above: the tick tells.
         let _ = self.policy.work_ahead(action.filter(|_| !self.fresh_policy));
@@ -308,14 +308,14 @@ impl Controller {
         }
     }
 
-    fn count_episode(&mut self, observation: &Observation, is_first: bool) {
+    fn count_episode(&mut self, observation: &Observation<'_>, is_first: bool) {
         if is_first {
             self.cut_episode();
         }
         self.running.get_or_insert_with(|| EpisodeResult::start(observation)).add(observation);
     }
 
-    fn finish_episode(&mut self, observation: &Observation) {
+    fn finish_episode(&mut self, observation: &Observation<'_>) {
         if observation.is(ObservationFlags::LAST)
             && let Some(mut episode) = self.running.take()
         {

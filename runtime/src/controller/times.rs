@@ -1,6 +1,6 @@
 //! The times of a tick, counted from when it was scheduled: one that is late or never answered cannot hide.
 
-use rcwm_models::wire::{Observation, ObservationFlags};
+use rcwm_models::wire::{ObservationHeader, ObservationFlags};
 
 use super::{Controller, Pace, TickTimes};
 use crate::pacing::Missing;
@@ -12,7 +12,7 @@ const UNANSWERED_TOLD_MAX: u64 = 1000;
 
 impl Controller {
     /// Ticks before this one, of this publisher, that were not answered in any way (real time).
-    pub(super) fn unanswered(&self, observation: &Observation, is_first: bool) -> u64 {
+    pub(super) fn unanswered(&self, observation: &ObservationHeader, is_first: bool) -> u64 {
         match self.answer {
             Some(answer) if !is_first && observation.period_ns > 0 => {
                 observation.sequence.saturating_sub(answer.answers.saturating_add(1))
@@ -25,7 +25,7 @@ impl Controller {
         self.telemetry.record_policy(&decision.stage_ns);
     }
 
-    pub(super) fn record_times(&mut self, observation: &Observation, times: &TickTimes, unanswered: u64) {
+    pub(super) fn record_times(&mut self, observation: &ObservationHeader, times: &TickTimes, unanswered: u64) {
         let TickTimes { scheduled_ns, published_ns, received_ns, .. } = *times;
         let period_ns = observation.period_ns;
         self.pace = Some(Pace::of(period_ns));

@@ -27,7 +27,7 @@ pub trait Transport {
     ///
     /// # Errors
     /// [`LinkError::Traffic`].
-    fn send(&self, action: Action) -> Result<u64, LinkError>;
+    fn send(&self, action: &Action) -> Result<u64, LinkError>;
 
     /// See [`ControllerLink::hello`].
     ///
@@ -58,7 +58,7 @@ impl Transport for ControllerLink {
         self.poll_observation()
     }
 
-    fn send(&self, action: Action) -> Result<u64, LinkError> {
+    fn send(&self, action: &Action) -> Result<u64, LinkError> {
         Self::send(self, action)
     }
 

@@ -6,8 +6,8 @@ use super::record::VERSION;
 
 /// The first bytes of a log.
 pub const MAGIC: [u8; 8] = *b"rcwm-log";
-/// Largest payload accepted, in bytes: a hundred times what a tick takes.
-const PAYLOAD_BYTES_MAX: usize = 1 << 20;
+/// Largest payload accepted, in bytes: far more than a tick of large cameras takes.
+const PAYLOAD_BYTES_MAX: usize = 64 << 20;
 
 /// What comes next in a file.
 pub enum Next<'a> {

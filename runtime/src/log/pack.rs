@@ -1,10 +1,6 @@
 //! Pictures without loss: the difference to the last one, in LZ4. From tick to tick most of a picture stays.
 
-use rcwm_models::{IMAGE_BYTES, MASK_BYTES};
 use serde::{Deserialize, Serialize};
-
-/// Bytes of a mask of one bit a pixel.
-const MASK_BITS_BYTES: usize = MASK_BYTES / 8;
 
 /// A packed picture.
 #[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
@@ -21,19 +17,20 @@ pub struct PackedMask {
 
 impl PackedMask {
     /// A pixel of more than one half is the robot.
-    pub fn pack(mask: &[u8; MASK_BYTES]) -> Self {
-        let mut bits = [0; MASK_BITS_BYTES];
-        for (byte, pixels) in bits.iter_mut().zip(mask.chunks_exact(8)) {
-            *byte = pixels.iter().fold(0, |byte, pixel| byte << 1 | u8::from(*pixel > 127));
-        }
+    pub fn pack(mask: &[u8]) -> Self {
+        let byte = |pixels: &[u8]| {
+            let bits = pixels.iter().fold(0_u8, |byte, pixel| byte << 1 | u8::from(*pixel > 127));
+            bits << (8 - pixels.len())
+        };
+        let bits: Vec<u8> = mask.chunks(8).map(byte).collect();
         Self { lz4: lz4_flex::block::compress(&bits) }
     }
 
     /// The mask, of 0 and 255.
-    pub fn unpack(&self, mask: &mut [u8; MASK_BYTES]) -> Result<(), String> {
-        let mut bits = [0; MASK_BITS_BYTES];
+    pub fn unpack(&self, mask: &mut [u8]) -> Result<(), String> {
+        let mut bits = vec![0; mask.len().div_ceil(8)];
         unpack(&self.lz4, &mut bits)?;
-        for (pixels, byte) in mask.chunks_exact_mut(8).zip(bits) {
+        for (pixels, byte) in mask.chunks_mut(8).zip(bits) {
             for (index, pixel) in pixels.iter_mut().enumerate() {
                 *pixel = if byte >> (7 - index) & 1 == 1 { 255 } else { 0 };
             }
@@ -42,58 +39,46 @@ impl PackedMask {
     }
 }
 
-/// Packs or unpacks one picture after another.
+/// Packs or unpacks the pictures of one camera, one after another.
+#[derive(Default)]
 pub struct ImagePacker {
-    last: Box<[u8; IMAGE_BYTES]>,
-    difference: Box<[u8; IMAGE_BYTES]>,
-    has_last: bool,
-}
-
-impl Default for ImagePacker {
-    /// Before the first picture.
-    fn default() -> Self {
-        let zeros = || Box::new([0; IMAGE_BYTES]);
-        Self { last: zeros(), difference: zeros(), has_last: false }
-    }
+    /// Empty before the first picture.
+    last: Vec<u8>,
+    difference: Vec<u8>,
 }
 
 impl ImagePacker {
     /// `whole` makes a picture that can be unpacked without those before it.
-    pub fn pack(&mut self, image: &[u8; IMAGE_BYTES], whole: bool) -> PackedImage {
-        let delta = self.has_last && !whole;
+    pub fn pack(&mut self, image: &[u8], whole: bool) -> PackedImage {
+        let delta = self.last.len() == image.len() && !whole;
         let lz4 = if delta {
-            self.difference.copy_from_slice(image);
-            subtract(&mut self.difference, &self.last);
-            lz4_flex::block::compress(&self.difference[..])
+            self.difference.clear();
+            self.difference.extend(image.iter().zip(&self.last).map(|(pixel, last)| pixel.wrapping_sub(*last)));
+            lz4_flex::block::compress(&self.difference)
         } else {
             lz4_flex::block::compress(image)
         };
-        self.last.copy_from_slice(image);
-        self.has_last = true;
+        self.remember(image);
         PackedImage { delta, lz4 }
     }
 
     /// The picture; those before it must have been unpacked, unless it is a whole one.
-    pub fn unpack(&mut self, packed: &PackedImage, image: &mut [u8; IMAGE_BYTES]) -> Result<(), String> {
-        if packed.delta && !self.has_last {
+    pub fn unpack(&mut self, packed: &PackedImage, image: &mut [u8]) -> Result<(), String> {
+        if packed.delta && self.last.len() != image.len() {
             return Err("a difference to a picture that is not there".into());
         }
         unpack(&packed.lz4, image)?;
         if packed.delta {
-            add(image, &self.last);
+            image.iter_mut().zip(&self.last).for_each(|(pixel, last)| *pixel = pixel.wrapping_add(*last));
         }
-        self.last.copy_from_slice(image);
-        self.has_last = true;
+        self.remember(image);
         Ok(())
     }
-}
 
-fn subtract(image: &mut [u8; IMAGE_BYTES], last: &[u8; IMAGE_BYTES]) {
-    image.iter_mut().zip(last).for_each(|(pixel, last)| *pixel = pixel.wrapping_sub(*last));
-}
-
-fn add(image: &mut [u8; IMAGE_BYTES], last: &[u8; IMAGE_BYTES]) {
-    image.iter_mut().zip(last).for_each(|(pixel, last)| *pixel = pixel.wrapping_add(*last));
+    fn remember(&mut self, image: &[u8]) {
+        self.last.clear();
+        self.last.extend_from_slice(image);
+    }
 }
 
 fn unpack(lz4: &[u8], to: &mut [u8]) -> Result<(), String> {
@@ -109,8 +94,10 @@ fn unpack(lz4: &[u8], to: &mut [u8]) -> Result<(), String> {
 mod tests {
     use super::*;
 
-    fn image(shift: usize) -> [u8; IMAGE_BYTES] {
-        std::array::from_fn(|index| ((index / 300 * 13) + usize::from(index % 900 < shift)) as u8)
+    const BYTES: usize = 64 * 64 * 3;
+
+    fn image(shift: usize) -> Vec<u8> {
+        (0..BYTES).map(|index| ((index / 300 * 13) + usize::from(index % 900 < shift)) as u8).collect()
     }
 
     #[test]
@@ -119,16 +106,16 @@ mod tests {
         for step in 0..40 {
             let packed = packer.pack(&image(step), step % 16 == 0);
             assert_eq!(packed.delta, step % 16 != 0);
-            let mut found = [0; IMAGE_BYTES];
+            let mut found = [0; BYTES];
             unpacker.unpack(&packed, &mut found).unwrap();
             assert_eq!(found, image(step));
-            assert!(packed.lz4.len() < IMAGE_BYTES / 4);
+            assert!(packed.lz4.len() < BYTES / 4);
         }
     }
 
     #[test]
     fn a_difference_to_nothing_and_a_short_picture_are_refused() {
-        let (mut packer, mut found) = (ImagePacker::default(), [0; IMAGE_BYTES]);
+        let (mut packer, mut found) = (ImagePacker::default(), [0; BYTES]);
         packer.pack(&image(0), false);
         let delta = packer.pack(&image(1), false);
         assert!(ImagePacker::default().unpack(&delta, &mut found).is_err());
@@ -138,9 +125,11 @@ mod tests {
 
     #[test]
     fn masks_come_back_as_all_or_nothing() {
-        let mask = std::array::from_fn(|index| if index % 3 == 0 { 255 } else { 0 });
-        let mut found = [7; MASK_BYTES];
-        PackedMask::pack(&mask).unpack(&mut found).unwrap();
-        assert_eq!(found, mask);
+        for pixels in [64 * 64, 61] {
+            let mask: Vec<u8> = (0..pixels).map(|index| if index % 3 == 0 { 255 } else { 0 }).collect();
+            let mut found = vec![7; pixels];
+            PackedMask::pack(&mask).unpack(&mut found).unwrap();
+            assert_eq!(found, mask);
+        }
     }
 }

@@ -5,7 +5,10 @@ use std::io::{BufReader, Read};
 use std::os::unix::fs::OpenOptionsExt;
 use std::path::{Path, PathBuf};
 
-use rcwm_models::wire::Observation;
+use std::sync::Arc;
+
+use rcwm_models::interface::Interface;
+use rcwm_models::wire::{Format, OwnedObservation};
 
 use super::LogError;
 use super::frames::{FrameReader, MAGIC, Next, read_up_to};
@@ -28,7 +31,7 @@ pub struct LoggedTick {
     /// What was written.
     pub record: TickRecord,
     /// The observation, mask included; none where nothing came.
-    pub observation: Option<Observation>,
+    pub observation: Option<OwnedObservation>,
 }
 
 /// Reads a log from its beginning.
@@ -36,7 +39,10 @@ pub struct LogReader {
     path: PathBuf,
     header: Header,
     frames: FrameReader<BufReader<File>>,
-    images: ImagePacker,
+    /// One a camera.
+    images: Vec<ImagePacker>,
+    /// By which interface observations are read.
+    format: Option<Arc<Format>>,
     ticks: u64,
     bytes: u64,
     finished: bool,
@@ -75,8 +81,8 @@ impl LogReader {
             return Err(no_log(format!("its header tells of {invalid}")));
         }
         let path = path.to_path_buf();
-        let images = ImagePacker::default();
-        Ok(Self { path, header, frames, images, ticks: 0, bytes, finished: false, over: false })
+        let (images, format) = (Vec::new(), None);
+        Ok(Self { path, header, frames, images, format, ticks: 0, bytes, finished: false, over: false })
     }
 
     /// What the run was made with.
@@ -134,6 +140,13 @@ impl LogReader {
                 self.ticks += 1;
                 Ok(Some(Entry::Tick(Box::new(LoggedTick { index: ticks, record: *record, observation }))))
             }
+            Record::Interface(text) => {
+                let interface = Interface::parse(&text).map_err(|error| damaged(error.to_string()))?;
+                self.images.clear();
+                self.images.resize_with(interface.camera.len(), ImagePacker::default);
+                self.format = Some(Format::of(interface));
+                self.read_entry(self.frames.offset)
+            }
             Record::Policy(identity) => Ok(Some(Entry::Policy(identity))),
             Record::End { .. } => {
                 self.finished = true;
@@ -142,12 +155,20 @@ impl LogReader {
         }
     }
 
-    fn observation(&mut self, record: &TickRecord) -> Result<Option<Observation>, String> {
+    fn observation(&mut self, record: &TickRecord) -> Result<Option<OwnedObservation>, String> {
         let Some(observed) = &record.observed else { return Ok(None) };
-        let mut observation = observed.without_picture();
-        self.images.unpack(&observed.image, &mut observation.image)?;
-        if let Some(mask) = &observed.mask {
-            mask.unpack(&mut observation.robot_mask)?;
+        let format = self.format.as_ref().ok_or("an observation before its interface")?;
+        let mut observation = observed.without_pictures(format)?;
+        let (cameras, found) = (self.images.len(), (observed.images.len(), observed.masks.len()));
+        if found != (cameras, cameras) {
+            return Err(format!("{found:?} pictures and masks, the interface has {cameras} cameras"));
+        }
+        let mut edited = observation.edit();
+        for (camera, packer) in self.images.iter_mut().enumerate() {
+            packer.unpack(&observed.images[camera], edited.image(camera))?;
+            if let Some(mask) = &observed.masks[camera] {
+                mask.unpack(edited.mask(camera).ok_or("a mask that the interface does not have")?)?;
+            }
         }
         Ok(Some(observation))
     }

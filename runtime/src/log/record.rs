@@ -1,9 +1,9 @@
 //! What a log holds.
 
-use rcwm_models::ACTION_LEN;
-use rcwm_models::PROPRIOCEPTION_LEN;
-use rcwm_models::bundle::Manifest;
-use rcwm_models::wire::{Action, Observation};
+use std::sync::Arc;
+
+use rcwm_models::bundle::{Limits, Manifest};
+use rcwm_models::wire::{Action, ActionValues, CAMERAS_MAX, Format, Observation, ObservationHeader, OwnedObservation};
 use serde::{Deserialize, Serialize};
 use sha2::{Digest, Sha256};
 
@@ -13,7 +13,7 @@ use crate::engine::EngineSettings;
 use crate::policy::{BranchState, CallKind, Sampling, State, Surprise};
 
 /// Version of the file.
-pub const VERSION: u32 = 1;
+pub const VERSION: u32 = 2;
 /// One record of so many holds the whole state and a whole picture.
 pub const KEYFRAME_TICKS: u64 = 256;
 /// Most threads that a run may have.
@@ -86,8 +86,8 @@ pub struct BundleIdentity {
     pub preset: String,
     /// sha256 of the initial state and of every part, by name.
     pub sha256: Vec<(String, String)>,
-    /// Smallest and largest values of each action component.
-    pub action_limits: [[f32; ACTION_LEN]; 2],
+    /// Smallest and largest values of each number of an action, in units.
+    pub action_limits: Limits,
 }
 
 impl BundleIdentity {
@@ -100,7 +100,7 @@ impl BundleIdentity {
             task: manifest.task.clone(),
             preset: manifest.provenance.preset.clone(),
             sha256: std::iter::once(initial).chain(parts).collect(),
-            action_limits: [manifest.control.action_low, manifest.control.action_high],
+            action_limits: manifest.limits(),
         }
     }
 
@@ -133,6 +133,8 @@ impl BundleIdentity {
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 pub enum Record {
     Tick(Box<TickRecord>),
+    /// The canonical text of the interface by which what follows was observed.
+    Interface(String),
     /// From here on another policy ran, from its initial state.
     Policy(BundleIdentity),
     /// The log was finished properly.
@@ -169,41 +171,43 @@ pub struct TickRecord {
     pub state: Option<WholeState>,
 }
 
-/// An observation but for its picture, which is packed.
+/// An observation, its pictures packed.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 pub struct Observed {
-    /// See [`Observation::sequence`].
+    /// See [`ObservationHeader::sequence`].
     pub sequence: u64,
-    /// See [`Observation::episode`].
+    /// See [`ObservationHeader::episode`].
     pub episode: u64,
-    /// See [`Observation::scheduled_ns`].
+    /// See [`ObservationHeader::scheduled_ns`].
     pub scheduled_ns: u64,
-    /// See [`Observation::published_ns`].
+    /// See [`ObservationHeader::published_ns`].
     pub published_ns: u64,
-    /// See [`Observation::period_ns`].
+    /// See [`ObservationHeader::period_ns`].
     pub period_ns: u64,
-    /// See [`Observation::step`].
+    /// See [`ObservationHeader::captured_ns`].
+    pub captured_ns: [u64; CAMERAS_MAX],
+    /// See [`ObservationHeader::step`].
     pub step: u32,
-    /// See [`Observation::flags`].
+    /// See [`ObservationHeader::flags`].
     pub flags: u32,
-    /// See [`Observation::task`].
+    /// See [`ObservationHeader::task`].
     pub task: u32,
-    /// See [`Observation::reward`].
+    /// See [`ObservationHeader::reward`].
     pub reward: f32,
-    /// See [`Observation::executed_action`].
-    pub executed_action: [f32; ACTION_LEN],
-    /// See [`Observation::proprioception`].
-    pub proprioception: [f32; PROPRIOCEPTION_LEN],
-    /// See [`Observation::image`].
-    pub image: PackedImage,
-    /// See [`Observation::robot_mask`]; one bit a pixel, where there is one.
-    pub mask: Option<PackedMask>,
+    /// See [`Observation::executed`].
+    pub executed: ActionValues,
+    /// See [`Observation::state`].
+    pub state: Vec<f32>,
+    /// See [`Observation::image`], one a camera.
+    pub images: Vec<PackedImage>,
+    /// See [`Observation::mask`]; one bit a pixel, where there is one.
+    pub masks: Vec<Option<PackedMask>>,
 }
 
 impl Observed {
-    /// Of an observation with its packed picture and mask.
+    /// Of an observation with its packed pictures and masks, one a camera.
     #[must_use]
-    pub fn of(observation: &Observation, image: PackedImage, mask: Option<PackedMask>) -> Self {
+    pub fn of(observation: &Observation<'_>, images: Vec<PackedImage>, masks: Vec<Option<PackedMask>>) -> Self {
         let o = observation;
         Self {
             sequence: o.sequence,
@@ -211,33 +215,47 @@ impl Observed {
             scheduled_ns: o.scheduled_ns,
             published_ns: o.published_ns,
             period_ns: o.period_ns,
+            captured_ns: o.captured_ns,
             step: o.step,
             flags: o.flags,
             task: o.task,
             reward: o.reward,
-            executed_action: o.executed_action,
-            proprioception: o.proprioception,
-            image,
-            mask,
+            executed: o.executed_action(),
+            state: o.state().to_vec(),
+            images,
+            masks,
         }
     }
 
-    /// The observation but for picture and mask, which are zeros.
-    pub fn without_picture(&self) -> Observation {
-        Observation {
+    /// The observation but for pictures and masks, which are zeros.
+    ///
+    /// # Errors
+    /// What in it is not of the format.
+    pub fn without_pictures(&self, format: &Arc<Format>) -> Result<OwnedObservation, String> {
+        let mut observation = OwnedObservation::zeroed(format);
+        *observation = ObservationHeader {
             sequence: self.sequence,
             episode: self.episode,
             scheduled_ns: self.scheduled_ns,
             published_ns: self.published_ns,
             period_ns: self.period_ns,
+            captured_ns: self.captured_ns,
             step: self.step,
             flags: self.flags,
             task: self.task,
             reward: self.reward,
-            executed_action: self.executed_action,
-            proprioception: self.proprioception,
-            ..Observation::zeroed()
+        };
+        let mut edited = observation.edit();
+        for (what, to, from) in
+            [("state", edited.state().len(), self.state.len()), ("executed action", edited.executed().len(), self.executed.len())]
+        {
+            if to != from {
+                return Err(format!("{what} of {from} numbers, the interface has {to}"));
+            }
         }
+        edited.state().copy_from_slice(&self.state);
+        edited.executed().copy_from_slice(&self.executed);
+        Ok(observation)
     }
 }
 
@@ -251,7 +269,7 @@ pub struct Answer {
     /// See [`Action::source`].
     pub source: u32,
     /// See [`Action::action`].
-    pub action: [f32; ACTION_LEN],
+    pub action: ActionValues,
 }
 
 impl From<Action> for Answer {
@@ -267,7 +285,7 @@ pub struct LoggedCall {
     /// What was asked.
     pub kind: CallKind,
     /// The action it was about; none at an episode's start.
-    pub action: Option<[f32; ACTION_LEN]>,
+    pub action: Option<ActionValues>,
     /// What the policy decided, or how it failed.
     pub outcome: LoggedOutcome,
 }
@@ -281,7 +299,7 @@ pub enum LoggedOutcome {
     StateSet(u32),
     /// A decision was made.
     Decided {
-        action: [f32; ACTION_LEN],
+        action: ActionValues,
         /// Work ahead was done again.
         recomputed: bool,
         /// How unexpected the picture was.

@@ -3,9 +3,10 @@
 use std::fs::File;
 use std::io::{BufWriter, ErrorKind, Write};
 use std::path::{Path, PathBuf};
+use std::sync::Arc;
 use std::time::{Duration, Instant};
 
-use rcwm_models::wire::{Observation, ObservationFlags};
+use rcwm_models::wire::{Format, Observation};
 
 use super::LogError;
 use super::frames::{MAGIC, write_frame, write_start};
@@ -65,7 +66,10 @@ pub struct LogWriter {
     path: PathBuf,
     to: BufWriter<File>,
     flushed: Instant,
-    images: ImagePacker,
+    /// One a camera.
+    images: Vec<ImagePacker>,
+    /// By which interface the last observation was.
+    format: Option<Arc<Format>>,
     bundles: Vec<PathBuf>,
     ticks: u64,
     bytes: u64,
@@ -88,7 +92,8 @@ impl LogWriter {
             path: file.to_path_buf(),
             to: BufWriter::with_capacity(1 << 16, opened),
             flushed: Instant::now(),
-            images: ImagePacker::default(),
+            images: Vec::new(),
+            format: None,
             bundles: vec![policy.folder().to_path_buf()],
             ticks: 0,
             bytes: MAGIC.len() as u64 + 4,
@@ -138,7 +143,10 @@ impl LogWriter {
             self.record(&Record::Policy(BundleIdentity::of(&policy.manifest)))?;
         }
         let keyframe = self.ticks.is_multiple_of(KEYFRAME_TICKS) || from.resumes;
-        let observed = from.observed.then(|| self.observed(&from.observation, keyframe));
+        if from.observed {
+            self.note_interface(&from.observation.view())?;
+        }
+        let observed = from.observed.then(|| self.observed(&from.observation.view(), keyframe));
         let record = TickRecord {
             dropped_before: from.dropped_before,
             resumes: from.resumes,
@@ -157,10 +165,24 @@ impl LogWriter {
         Ok(())
     }
 
-    fn observed(&mut self, observation: &Observation, keyframe: bool) -> Observed {
-        let image = self.images.pack(&observation.image, keyframe);
-        let masked = observation.is(ObservationFlags::MASK_VALID);
-        Observed::of(observation, image, masked.then(|| PackedMask::pack(&observation.robot_mask)))
+    fn observed(&mut self, observation: &Observation<'_>, keyframe: bool) -> Observed {
+        let cameras = 0..observation.format().interface().camera.len();
+        let images = self.images.iter_mut().enumerate();
+        let images = images.map(|(camera, packer)| packer.pack(observation.image(camera), keyframe)).collect();
+        let masks = cameras.map(|camera| observation.mask(camera).map(PackedMask::pack)).collect();
+        Observed::of(observation, images, masks)
+    }
+
+    /// Writes by which interface the observations that follow are.
+    fn note_interface(&mut self, observation: &Observation<'_>) -> Result<(), LogError> {
+        if self.format.as_ref() == Some(observation.format()) {
+            return Ok(());
+        }
+        let interface = observation.format().interface();
+        self.images.clear();
+        self.images.resize_with(interface.camera.len(), ImagePacker::default);
+        self.format = Some(Arc::clone(observation.format()));
+        self.record(&Record::Interface(interface.canonical()))
     }
 
     fn record(&mut self, record: &Record) -> Result<(), LogError> {

@@ -18,7 +18,7 @@
 
 use std::time::Duration;
 
-use rcwm_models::wire::{Observation, ObservationFlags};
+use rcwm_models::wire::{ObservationHeader, ObservationFlags};
 
 /// Shortest period that is believed, in ns: one that a peer has garbled must not make the loop run wild.
 const PERIOD_NS_MIN: u64 = 50_000;
@@ -87,8 +87,8 @@ pub struct Stamps {
 impl Stamps {
     /// Those of an observation that was received at `received_ns`.
     #[must_use]
-    pub fn of(observation: &Observation, received_ns: u64) -> Self {
-        let Observation { scheduled_ns, published_ns, period_ns, .. } = *observation;
+    pub fn of(observation: &ObservationHeader, received_ns: u64) -> Self {
+        let ObservationHeader { scheduled_ns, published_ns, period_ns, .. } = *observation;
         let published_ahead_ns = published_ns.saturating_sub(received_ns);
         // One may be published a little before it is due.
         let scheduled_ahead_ns = scheduled_ns.saturating_sub(received_ns.saturating_add(period_ns));
@@ -148,7 +148,7 @@ impl Pacing {
     }
 
     /// Takes the schedule over from an observation that was received at `received_ns`. After the last of an episode nothing is due: a reset takes its time.
-    pub fn observed(&mut self, observation: &Observation, received_ns: u64) {
+    pub fn observed(&mut self, observation: &ObservationHeader, received_ns: u64) {
         if observation.period_ns == 0 || observation.is(ObservationFlags::LAST) {
             self.schedule = None;
             return;
@@ -191,7 +191,7 @@ impl Pacing {
     /// Whether an observation was scheduled so long ago that an answer to it would do harm. Never so in lock-step, where the
     /// publisher waits.
     #[must_use]
-    pub fn is_stale(&self, observation: &Observation, received_ns: u64) -> bool {
+    pub fn is_stale(&self, observation: &ObservationHeader, received_ns: u64) -> bool {
         let age_ns = received_ns.saturating_sub(Stamps::of(observation, received_ns).scheduled_ns);
         observation.period_ns > 0
             && age_ns > share(observation.period_ns.max(PERIOD_NS_MIN), self.settings.stale_periods)

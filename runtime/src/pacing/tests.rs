@@ -8,14 +8,14 @@ fn settings() -> PacingSettings {
 }
 
 /// Sequence 7, scheduled at 10 ms, published 0.2 ms later, every ms.
-fn observation() -> Observation {
-    let mut observation = Observation::zeroed();
+fn observation() -> ObservationHeader {
+    let mut observation = ObservationHeader::zeroed();
     (observation.sequence, observation.period_ns) = (7, PERIOD_NS);
     (observation.scheduled_ns, observation.published_ns) = (10_000_000, PUBLISHED_NS);
     observation
 }
 
-fn after(observation: &Observation) -> Pacing {
+fn after(observation: &ObservationHeader) -> Pacing {
     let mut pacing = Pacing::new(settings());
     pacing.observed(observation, observation.published_ns);
     pacing
@@ -146,7 +146,7 @@ fn stale_is_what_was_scheduled_more_than_two_periods_before_it_came() {
 #[test]
 fn nothing_was_scheduled_or_published_later_than_it_was_received() {
     let (received_ns, late_ns) = (PUBLISHED_NS + 50_000, PUBLISHED_NS + 3 * PERIOD_NS);
-    let seen = |scheduled_ns, published_ns| Observation { scheduled_ns, published_ns, ..observation() };
+    let seen = |scheduled_ns, published_ns| ObservationHeader { scheduled_ns, published_ns, ..observation() };
     let stamps = |seen: Observation| {
         let Stamps { scheduled_ns, published_ns, ahead_ns } = Stamps::of(&seen, received_ns);
         (scheduled_ns, published_ns, ahead_ns)

@@ -2,8 +2,8 @@
 
 use std::sync::atomic::{AtomicU64, Ordering};
 
-use rcwm_models::ACTION_LEN;
 use rcwm_models::bundle::PartName;
+use rcwm_models::wire::ActionValues;
 use serde::{Deserialize, Serialize};
 
 use super::{Decision, PolicyError, STAGES, Surprise};
@@ -40,7 +40,7 @@ pub enum CallOutcome {
     /// A decision was made.
     Decided {
         /// The action, within the bundle's limits.
-        action: [f32; ACTION_LEN],
+        action: ActionValues,
         /// Work ahead was for another action and was done again.
         recomputed: bool,
         /// How unexpected the image was.
@@ -62,7 +62,7 @@ pub struct Call {
     /// What was asked.
     pub kind: CallKind,
     /// The action it was about; none at an episode's start.
-    pub action: Option<[f32; ACTION_LEN]>,
+    pub action: Option<ActionValues>,
     /// How it ended.
     pub outcome: CallOutcome,
 }
@@ -117,7 +117,7 @@ impl CallRing {
         }
     }
 
-    pub(super) fn note(&mut self, kind: CallKind, action: Option<&[f32; ACTION_LEN]>, outcome: CallOutcome) {
+    pub(super) fn note(&mut self, kind: CallKind, action: Option<&ActionValues>, outcome: CallOutcome) {
         self.calls[(self.made % CALLS_MAX as u64) as usize] = Call { kind, action: action.copied(), outcome };
         self.made += 1;
     }
@@ -146,7 +146,7 @@ mod tests {
     fn calls_are_remembered_in_order_up_to_a_limit() {
         let mut ring = CallRing::new();
         for number in 0..CALLS_MAX + 10 {
-            ring.note(CallKind::Imagine, Some(&[number as f32; 4]), CallOutcome::Refused);
+            ring.note(CallKind::Imagine, Some(&[number as f32; 4].into()), CallOutcome::Refused);
         }
         let seen = |first| -> Vec<f32> { ring.since(first).map(|call| call.action.unwrap()[0]).collect() };
         assert_eq!(seen(ring.made() - 2), [40.0, 41.0]);

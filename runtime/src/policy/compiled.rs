@@ -10,8 +10,8 @@ mod places;
 use std::sync::Arc;
 use std::time::Duration;
 
-use rcwm_models::ACTION_LEN;
 use rcwm_models::bundle::{Bundle, PartName};
+use rcwm_models::wire::ActionValues;
 use tract_onnx::prelude::TractResult;
 
 use super::parts::finite;
@@ -95,10 +95,10 @@ impl Compiled {
     }
 
     /// The tick's inputs but the image.
-    fn fill(&mut self, action: &[f32; ACTION_LEN], work: &Work<'_>) -> TractResult<()> {
+    fn fill(&mut self, action: &ActionValues, work: &Work<'_>) -> TractResult<()> {
         let (Self { values, places, .. }, Work { state, noise, .. }) = (self, work);
         let Places { robot, environment, .. } = places;
-        values.fill(places.action, action.as_slice())?;
+        values.fill(places.action, action)?;
         values.fill(robot.z, &state.robot.z)?;
         values.fill(robot.h, &state.robot.h)?;
         values.fill(robot.noise, noise.robot())?;
@@ -150,7 +150,7 @@ fn run_error(part: PartName, error: &tract_onnx::prelude::TractError) -> PolicyE
 }
 
 impl Tick for Compiled {
-    fn work_ahead(&mut self, action: &[f32; ACTION_LEN], work: &mut Work<'_>) -> Result<(), PolicyError> {
+    fn work_ahead(&mut self, action: &ActionValues, work: &mut Work<'_>) -> Result<(), PolicyError> {
         self.fill(action, work).map_err(|error| run_error(PartName::Robot, &error))?;
         for piece in &mut self.early {
             piece.run(&mut self.values).map_err(|error| run_error(piece.part, &error))?;

@@ -34,7 +34,8 @@ use std::path::{Path, PathBuf};
 use std::time::Instant;
 
 use rcwm_models::bundle::{Bundle, Manifest, PartName};
-use rcwm_models::{ACTION_LEN, IMAGE_BYTES};
+use rcwm_models::interface::{Interface, Normaliser};
+use rcwm_models::wire::ActionValues;
 
 use crate::engine::{EngineSettings, Form};
 use calls::CallRing;
@@ -58,12 +59,12 @@ pub struct Surprise {
 /// What the policy decided on one observation.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct Decision {
-    /// The action to execute, within the bundle's limits.
-    pub action: [f32; ACTION_LEN],
-    /// Mean of the action distribution.
-    pub mean: [f32; ACTION_LEN],
+    /// The action to execute, in the interface's units and within the bundle's limits.
+    pub action: ActionValues,
+    /// Mean of the action distribution, which is over [-1, 1].
+    pub mean: ActionValues,
     /// Its standard deviation.
-    pub std: [f32; ACTION_LEN],
+    pub std: ActionValues,
     /// Time spent in each of [`STAGES`] after the image was there, in ns; 0 for one that had been worked ahead.
     pub stage_ns: [u64; STAGES.len()],
     /// How unexpected the image was; none where there was no image ([`Policy::imagine`]).
@@ -79,7 +80,7 @@ pub struct Decision {
 enum Before {
     /// Nothing: it is the first of its episode.
     Start,
-    Action([f32; ACTION_LEN]),
+    Action(ActionValues),
 }
 
 /// A policy that carries its state from tick to tick.
@@ -87,6 +88,8 @@ pub struct Policy {
     folder: PathBuf,
     manifest: Manifest,
     limits: ActionLimits,
+    /// Between the interface's units and the model's [-1, 1].
+    normaliser: Normaliser,
     tick: Box<dyn Tick>,
     buffers: Buffers,
     initial: State,
@@ -114,7 +117,8 @@ impl Policy {
         let model = &bundle.manifest.model;
         let initial = State::from(&bundle.initial);
         let mut policy = Self {
-            limits: ActionLimits::of(&bundle.manifest.control),
+            limits: ActionLimits::of(&bundle.manifest),
+            normaliser: Normaliser::of(&bundle.manifest.interface),
             tick: load_tick(bundle, engine)?,
             buffers: Buffers::new(model),
             state: initial.clone(),
@@ -131,9 +135,10 @@ impl Policy {
 
     /// Runs some ticks on a black image, so that the first real one finds memory and caches ready.
     fn warm_up(&mut self, sampling: Sampling) -> Result<(), PolicyError> {
-        let image = vec![0; IMAGE_BYTES];
+        let image = vec![0; self.image_bytes()];
+        let middle = self.limits.clamp(ActionValues::zeros(self.limits.numbers()));
         for tick in 0..3 {
-            match self.observe(&image, (tick > 0).then_some(&[0.0; ACTION_LEN])) {
+            match self.observe(&image, (tick > 0).then_some(&middle)) {
                 // Poisoned weights must not stop a controller that has a fallback: they are reported tick by tick.
                 Ok(_) | Err(PolicyError::NotFinite { .. }) => {}
                 Err(error) => return Err(error),
@@ -149,7 +154,8 @@ impl Policy {
 
     /// Decides on one observation and carries the state on.
     ///
-    /// `image` is 64 x 64 x 3, upright, RGB; `executed_action` is what was really executed to get here, and none at the first
+    /// `image` is of the size of the encoder's input, upright, RGB; `executed_action`, in the interface's units, is what was really
+    /// executed to get here, and none at the first
     /// observation of an episode, which starts from the learned initial state.
     ///
     /// # Errors
@@ -158,13 +164,13 @@ impl Policy {
     pub fn observe(
         &mut self,
         image: &[u8],
-        executed_action: Option<&[f32; ACTION_LEN]>,
+        executed_action: Option<&ActionValues>,
     ) -> Result<Decision, PolicyError> {
-        let before = match image.len() {
-            IMAGE_BYTES => self.before(executed_action),
-            found => {
-                Err(PolicyError::Observation(format!("the image has {found} bytes, expected {IMAGE_BYTES}")))
-            }
+        let (found, expected) = (image.len(), self.image_bytes());
+        let before = if found == expected {
+            self.before(executed_action)
+        } else {
+            Err(PolicyError::Observation(format!("the image has {found} bytes, expected {expected}")))
         };
         self.decide(CallKind::Observe, executed_action, before, |tick, work| {
             tick.observe(image, work)?;
@@ -178,7 +184,7 @@ impl Policy {
     ///
     /// # Errors
     /// As [`Self::observe`].
-    pub fn work_ahead(&mut self, action: Option<&[f32; ACTION_LEN]>) -> Result<(), PolicyError> {
+    pub fn work_ahead(&mut self, action: Option<&ActionValues>) -> Result<(), PolicyError> {
         let start = Instant::now();
         let result =
             self.before(action).and_then(|before| self.prepare(before, &mut StageClock::start()).map(drop));
@@ -204,7 +210,7 @@ impl Policy {
     ///
     /// # Errors
     /// As [`Self::observe`].
-    pub fn imagine(&mut self, executed_action: &[f32; ACTION_LEN]) -> Result<Decision, PolicyError> {
+    pub fn imagine(&mut self, executed_action: &ActionValues) -> Result<Decision, PolicyError> {
         let before = self.before(Some(executed_action));
         self.decide(CallKind::Imagine, Some(executed_action), before, |tick, work| {
             tick.imagine(work).map(|()| None)
@@ -212,15 +218,19 @@ impl Policy {
     }
 
     /// What stands before the tick; an episode's start goes back to the learned initial state.
-    fn before(&mut self, action: Option<&[f32; ACTION_LEN]>) -> Result<Before, PolicyError> {
+    fn before(&mut self, action: Option<&ActionValues>) -> Result<Before, PolicyError> {
         match action {
             None => {
                 self.reset();
                 Ok(Before::Start)
             }
-            Some(action) if action.iter().all(|x| x.is_finite()) => Ok(Before::Action(*action)),
+            Some(action) if action.is_finite() && action.len() == self.limits.numbers() => {
+                Ok(Before::Action(*action))
+            }
             Some(action) => {
-                Err(PolicyError::Observation(format!("executed action {action:?} is not finite")))
+                let expected = self.limits.numbers();
+                let text = format!("executed action {action:?}, expected {expected} finite numbers");
+                Err(PolicyError::Observation(text))
             }
         }
     }
@@ -235,10 +245,11 @@ impl Policy {
             // Done again, a tick keeps its noise: one draw a tick, whatever was assumed.
             self.noise.draw();
         }
-        let action = match before {
-            Before::Start => [0.0; ACTION_LEN],
-            Before::Action(action) => action,
-        };
+        let mut action = ActionValues::zeros(self.limits.numbers());
+        if let Before::Action(executed) = before {
+            // Finite: see `before`.
+            let _ = self.normaliser.from_units(&executed, &mut action);
+        }
         let (tick, mut work) = self.work(clock);
         tick.work_ahead(&action, &mut work)?;
         self.ahead = Some(before);
@@ -254,7 +265,7 @@ impl Policy {
     fn decide(
         &mut self,
         kind: CallKind,
-        executed_action: Option<&[f32; ACTION_LEN]>,
+        executed_action: Option<&ActionValues>,
         before: Result<Before, PolicyError>,
         tick: impl FnOnce(&mut dyn Tick, &mut Work<'_>) -> Result<Option<Surprise>, PolicyError>,
     ) -> Result<Decision, PolicyError> {
@@ -276,10 +287,13 @@ impl Policy {
         let surprise = tick(of_engine, &mut work)?;
         let StageClock { spent_ns: stage_ns, helper_late, .. } = clock;
         let (mean, std) = (self.buffers.mean, self.buffers.std);
-        let action = self.noise.action(&mean, &std);
+        let decided = self.noise.action(&mean, &std);
         // A sample of two finite numbers can be too large for one: no limit makes that an action.
-        parts::finite(PartName::Actor, "mean", &action)?;
+        parts::finite(PartName::Actor, "mean", &decided)?;
         self.buffers.give_posterior(&mut self.state);
+        let mut action = decided;
+        // Finite: see above.
+        let _ = self.normaliser.to_units(&decided, &mut action);
         let action = self.limits.clamp(action);
         Ok(Decision { action, mean, std, stage_ns, surprise, recomputed, helper_late })
     }
@@ -332,6 +346,20 @@ impl Policy {
         self.noise.set(robot, environment)
     }
 
+    /// Which of a robot's cameras the policy sees.
+    #[must_use]
+    pub fn camera(&self, robot: &Interface) -> Option<usize> {
+        let inputs = &self.manifest.policy.inputs;
+        robot.camera.iter().position(|camera| inputs.contains(&camera.name))
+    }
+
+    /// Bytes of the encoder's image.
+    #[must_use]
+    pub fn image_bytes(&self) -> usize {
+        let encoder = self.manifest.parts.iter().find(|part| part.name == PartName::Encoder);
+        encoder.and_then(|part| part.inputs.first()).map_or(0, |image| image.shape.iter().product())
+    }
+
     /// The bundle's folder.
     #[must_use]
     pub fn folder(&self) -> &Path {
@@ -373,7 +401,7 @@ impl Policy {
         &self.manifest
     }
 
-    /// The bundle's action limits.
+    /// The bundle's limits of actions.
     #[must_use]
     pub fn limits(&self) -> ActionLimits {
         self.limits

@@ -2,8 +2,8 @@
 
 use rand::{Rng, SeedableRng};
 use rand_chacha::ChaCha8Rng;
-use rcwm_models::ACTION_LEN;
 use rcwm_models::settings::ModelSettings;
+use rcwm_models::wire::ActionValues;
 
 use super::PolicyError;
 
@@ -85,10 +85,10 @@ impl NoiseSource {
         &self.environment
     }
 
-    pub(super) fn action(&mut self, mean: &[f32; ACTION_LEN], std: &[f32; ACTION_LEN]) -> [f32; ACTION_LEN] {
+    pub(super) fn action(&mut self, mean: &ActionValues, std: &ActionValues) -> ActionValues {
         match &mut self.rng {
             None => *mean,
-            Some(rng) => std::array::from_fn(|i| mean[i] + std[i] * gaussian(rng)),
+            Some(rng) => ActionValues::from_fn(mean.len(), |i| mean[i] + std[i] * gaussian(rng)),
         }
     }
 }

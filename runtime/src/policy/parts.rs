@@ -1,9 +1,9 @@
 //! The five parts of a tick and the buffers between them.
 
 use pulp::Arch;
-use rcwm_models::ACTION_LEN;
 use rcwm_models::bundle::{Bundle, PartName};
 use rcwm_models::settings::ModelSettings;
+use rcwm_models::wire::ActionValues;
 
 use super::{BranchState, PolicyError, State, Surprise};
 use crate::engine::{self, EngineError, EngineSettings, Input, Output, Part};
@@ -35,9 +35,9 @@ pub struct Buffers {
     /// Attention map, `[n, n + k]`.
     pub attention: Vec<f32>,
     pub environment: BranchBuffers,
-    pub mean: [f32; ACTION_LEN],
+    pub mean: ActionValues,
     /// Standard deviation of the action.
-    pub std: [f32; ACTION_LEN],
+    pub std: ActionValues,
     classes: usize,
 }
 
@@ -67,8 +67,8 @@ impl Buffers {
             e: vec![0.0; width],
             attention: vec![0.0; n * (n + model.interaction_rows())],
             environment: branch,
-            mean: [0.0; ACTION_LEN],
-            std: [0.0; ACTION_LEN],
+            mean: ActionValues::zeros(model.action),
+            std: ActionValues::zeros(model.action),
             classes: model.classes,
         }
     }
@@ -183,7 +183,7 @@ impl Parts {
     pub(super) fn run_robot(
         &mut self,
         state: &BranchState,
-        action: &[f32; ACTION_LEN],
+        action: &ActionValues,
         noise: &[f32],
         to: &mut Buffers,
     ) -> Result<(), PolicyError> {

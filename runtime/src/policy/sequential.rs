@@ -2,8 +2,8 @@
 //!
 //! Each branch is one part with prior and posterior in it, so that nothing can be worked ahead.
 
-use rcwm_models::ACTION_LEN;
 use rcwm_models::bundle::{Bundle, PartName};
+use rcwm_models::wire::ActionValues;
 
 use super::PolicyError;
 use super::parts::Parts;
@@ -13,12 +13,12 @@ use crate::engine::{EngineError, EngineSettings};
 /// The five parts of a tick and the action before it.
 pub(super) struct Sequential {
     parts: Parts,
-    action: [f32; ACTION_LEN],
+    action: ActionValues,
 }
 
 impl Sequential {
     pub(super) fn load(bundle: &Bundle, settings: EngineSettings) -> Result<Self, EngineError> {
-        Ok(Self { parts: Parts::load(bundle, settings)?, action: [0.0; ACTION_LEN] })
+        Ok(Self { parts: Parts::load(bundle, settings)?, action: ActionValues::zeros(bundle.manifest.model.action) })
     }
 
     fn branches(&mut self, work: &mut Work<'_>) -> Result<(), PolicyError> {
@@ -41,7 +41,7 @@ impl Sequential {
 
 impl Tick for Sequential {
     /// Remembers the action: all else waits for the image.
-    fn work_ahead(&mut self, action: &[f32; ACTION_LEN], _: &mut Work<'_>) -> Result<(), PolicyError> {
+    fn work_ahead(&mut self, action: &ActionValues, _: &mut Work<'_>) -> Result<(), PolicyError> {
         self.action = *action;
         Ok(())
     }

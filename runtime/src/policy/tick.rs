@@ -1,6 +1,6 @@
 //! How a tick is computed: the exported parts one after another, or the compiled tick.
 
-use rcwm_models::ACTION_LEN;
+use rcwm_models::wire::ActionValues;
 
 use super::noise::NoiseSource;
 use super::stages::StageClock;
@@ -17,7 +17,7 @@ pub(super) struct Work<'a> {
 /// The three things a tick is made of.
 pub(super) trait Tick: Send {
     /// All that needs only the action.
-    fn work_ahead(&mut self, action: &[f32; ACTION_LEN], work: &mut Work<'_>) -> Result<(), PolicyError>;
+    fn work_ahead(&mut self, action: &ActionValues, work: &mut Work<'_>) -> Result<(), PolicyError>;
 
     /// All else, once the image is there: 64 x 64 x 3 bytes.
     fn observe(&mut self, image: &[u8], work: &mut Work<'_>) -> Result<(), PolicyError>;

@@ -3,7 +3,7 @@
 use std::path::PathBuf;
 
 use rcwm_models::bundle::Manifest;
-use rcwm_models::wire::{Action, Observation};
+use rcwm_models::wire::{Action, ActionValues, Format, OwnedObservation};
 
 use crate::controller::{Counters, EpisodeResult, Tick, TickTimes};
 use crate::policy::{CALLS_MAX, Call, Policy, State};
@@ -18,7 +18,7 @@ pub struct Record {
     /// Whether something was observed.
     pub observed: bool,
     /// The observation; its picture and mask only where a sink wants them.
-    pub observation: Observation,
+    pub observation: OwnedObservation,
     /// The policy's state started anew.
     pub is_first: bool,
     /// The answer was not sent.
@@ -83,7 +83,7 @@ impl Progress {
 
 impl Record {
     pub(super) fn new(policy: &Policy) -> Self {
-        let observation = Observation::zeroed();
+        let observation = OwnedObservation::zeroed(&Format::of(policy.manifest().interface.clone()));
         Self {
             observed: false,
             running: EpisodeResult::start(&observation),
@@ -91,7 +91,7 @@ impl Record {
             is_first: false,
             overtaken: false,
             times: TickTimes { scheduled_ns: 0, published_ns: 0, received_ns: 0, sent_ns: 0 },
-            answer: Action { answers: 0, published_ns: 0, source: 0, reserved: 0, action: [0.0; 4] },
+            answer: Action { answers: 0, published_ns: 0, source: 0, action: ActionValues::default() },
             calls: Vec::with_capacity(CALLS_MAX),
             resumes: false,
             dropped_before: 0,
@@ -115,8 +115,8 @@ impl Record {
         self.exchanged = exchanged.then(|| Box::new(RunningPolicy::of(policy)));
         self.observed = tick.observation.is_some();
         match tick.observation {
-            Some(observation) if pictures => self.observation.clone_from(observation),
-            Some(observation) => copy_numbers(observation, &mut self.observation),
+            Some(observation) if pictures => self.observation.copy(observation),
+            Some(observation) => self.observation.copy_numbers(observation),
             None => {}
         }
         (self.is_first, self.overtaken, self.times) = (tick.is_first, tick.overtaken, tick.times);
@@ -144,15 +144,4 @@ impl Record {
             dropped: 0,
         };
     }
-}
-
-/// All of an observation but its picture and mask.
-fn copy_numbers(from: &Observation, to: &mut Observation) {
-    to.sequence = from.sequence;
-    to.episode = from.episode;
-    to.scheduled_ns = from.scheduled_ns;
-    to.published_ns = from.published_ns;
-    to.period_ns = from.period_ns;
-    (to.step, to.flags, to.task, to.reward) = (from.step, from.flags, from.task, from.reward);
-    (to.executed_action, to.proprioception) = (from.executed_action, from.proprioception);
 }

@@ -42,6 +42,7 @@ use std::thread::JoinHandle;
 use std::time::{Duration, Instant};
 
 use rcwm_models::bundle::BundleError;
+use rcwm_models::interface::{Interface, Mismatch};
 use rcwm_models::wire::LinkSettings;
 
 use crate::engine::EngineSettings;
@@ -80,6 +81,9 @@ pub enum SwapError {
         /// The running bundle's rate, in Hz.
         expected: f64,
     },
+    /// The bundle was made for another robot.
+    #[error("the bundle is for another robot than the running one: {0}; start a new run")]
+    DoesNotFit(Mismatch),
     /// Loading panicked; the thread that loads has gone on.
     #[error("loading the bundle failed inside the engine: {0}; export it again")]
     Panicked(String),
@@ -136,8 +140,8 @@ pub struct SwapSettings {
     pub engine: EngineSettings,
     /// How they choose latents and actions.
     pub sampling: Sampling,
-    /// Decisions per second of the running policy, in Hz; another policy must have the same.
-    pub rate_hz: f64,
+    /// That of the running policy; another one must fit it.
+    pub interface: Interface,
 }
 
 /// How long the end of a run waits for its server.

@@ -39,9 +39,12 @@ fn try_prepare(
     let still_wanted = || if wanted() { Ok(()) } else { Err(SwapError::Unwanted) };
     still_wanted()?;
     let bundle = Bundle::open(folder)?;
-    let (found, expected) = (bundle.manifest.control.rate_hz, settings.rate_hz);
+    let (found, expected) = (bundle.manifest.interface.rate_hz, settings.interface.rate_hz);
     if found != expected {
         return Err(SwapError::Rate { found, expected });
+    }
+    if let Some(mismatch) = bundle.manifest.mismatches(&settings.interface).into_iter().next() {
+        return Err(SwapError::DoesNotFit(mismatch));
     }
     still_wanted()?;
     // In the form that will run: its threads, its weights.

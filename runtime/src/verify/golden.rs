@@ -3,8 +3,8 @@
 use std::path::PathBuf;
 
 use rcwm_models::bundle::{Bundle, DType, PartName, TensorSpec};
+use rcwm_models::wire::ActionValues;
 use rcwm_models::tensors::{Tensors, TensorsError, Values};
-use rcwm_models::{ACTION_LEN, IMAGE_BYTES};
 
 use super::VerifyError;
 use crate::policy::State;
@@ -22,9 +22,12 @@ impl<'a> Golden<'a> {
     pub(super) fn of(bundle: &'a Bundle) -> Result<Self, VerifyError> {
         let mut this = Self { bundle, ticks: usize::MAX };
         let noise_len = 2 * bundle.manifest.model.stoch_width();
+        let encoder = bundle.manifest.parts.iter().find(|part| part.name == PartName::Encoder);
+        let image = encoder.and_then(|part| part.inputs.first());
+        let image_bytes = image.map_or(0, |image| image.shape.iter().product());
         let ticks = [
-            this.rows("input/image", DType::U8, IMAGE_BYTES)?,
-            this.rows("input/action", DType::F32, ACTION_LEN)?,
+            this.rows("input/image", DType::U8, image_bytes)?,
+            this.rows("input/action", DType::F32, bundle.manifest.model.action)?,
             this.rows("input/is_first", DType::U8, 1)?,
             this.rows("input/robot_noise", DType::F32, noise_len)?,
             this.rows("input/environment_noise", DType::F32, noise_len)?,
@@ -116,13 +119,12 @@ impl<'a> Golden<'a> {
         Ok(tick == 0 || self.u8("input/is_first", tick)?[0] != 0)
     }
 
-    /// The action that leads to the tick: zeros where an episode begins.
-    pub(super) fn action(&self, tick: usize) -> Result<[f32; ACTION_LEN], VerifyError> {
+    /// The action that leads to the tick, as the model has it: zeros where an episode begins.
+    pub(super) fn action(&self, tick: usize) -> Result<ActionValues, VerifyError> {
         if self.is_first(tick)? {
-            return Ok([0.0; ACTION_LEN]);
+            return Ok(ActionValues::zeros(self.bundle.manifest.model.action));
         }
-        let action = self.f32("input/action", tick)?;
-        Ok(std::array::from_fn(|i| action[i]))
+        Ok(self.f32("input/action", tick)?.iter().copied().collect())
     }
 
     /// Gumbel noise of a branch, `[2, n, m]`.

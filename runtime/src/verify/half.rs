@@ -1,6 +1,6 @@
 //! What 16-bit weights change: the same ticks with both, from the same states and noise.
 
-use rcwm_models::ACTION_LEN;
+use rcwm_models::wire::ActionValues;
 use rcwm_models::bundle::Bundle;
 use serde::Serialize;
 
@@ -39,12 +39,12 @@ pub fn half_weights(bundle: &Bundle) -> Result<HalfReport, VerifyError> {
     let load = |settings| Policy::new(bundle, settings, Sampling::Sample { seed: 1 });
     let (mut exact, mut half) = (load(settings)?, load(settings.with_form(Form::Compiled(half)))?);
     let mut report = HalfReport::default();
-    let (mut executed, mut error_sum) = (None::<[f32; ACTION_LEN]>, 0.0_f64);
+    let (mut executed, mut error_sum) = (None::<ActionValues>, 0.0_f64);
     for tick in 0..HALF_TICKS {
         let image = golden.image(tick % golden.ticks)?;
         let (right, rounded) =
             (exact.observe(image, executed.as_ref())?, half.observe(image, executed.as_ref())?);
-        for (right, rounded) in right.mean.iter().zip(rounded.mean) {
+        for (right, rounded) in right.mean.iter().zip(rounded.mean.iter()) {
             let error = (right - rounded).abs();
             report.action_error_max = report.action_error_max.max(error);
             error_sum += f64::from(error);
@@ -54,7 +54,7 @@ pub fn half_weights(bundle: &Bundle) -> Result<HalfReport, VerifyError> {
         executed = (tick % 50 != 49).then_some(right.action);
     }
     report.ticks = HALF_TICKS;
-    report.action_error_mean = (error_sum / (HALF_TICKS * ACTION_LEN) as f64) as f32;
+    report.action_error_mean = (error_sum / (HALF_TICKS * bundle.manifest.model.action) as f64) as f32;
     Ok(report)
 }
 

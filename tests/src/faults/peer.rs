@@ -102,7 +102,7 @@ struct Peer {
     images: Vec<[u8; IMAGE_BYTES]>,
     period_ns: u64,
     sequence: u64,
-    executed: [f32; ACTION_LEN],
+    executed: ActionValues,
     held: bool,
     delayed: VecDeque<(u64, Observation)>,
     served: Served,

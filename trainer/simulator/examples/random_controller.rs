@@ -36,7 +36,6 @@ fn main() -> Result<()> {
             answers: observation.sequence,
             published_ns: 0,
             source: ActionSource::Policy as u32,
-            reserved: 0,
             action: std::array::from_fn(|_| random.random_range(-1.0..=1.0)),
         })?;
         answered += 1;

@@ -128,7 +128,7 @@ impl Environment {
     ///
     /// # Errors
     /// [`SimulatorError::Python`]; also after [`STEPS_MAX`] steps without a reset.
-    pub fn step(&self, action: [f32; ACTION_LEN]) -> Result<(), SimulatorError> {
+    pub fn step(&self, action: ActionValues) -> Result<(), SimulatorError> {
         let [x, y, z, grip] = action;
         self.call("executing an action", "step", (x, y, z, grip))
     }
@@ -137,7 +137,7 @@ impl Environment {
     ///
     /// # Errors
     /// [`SimulatorError::Python`].
-    pub fn expert_action(&self) -> Result<[f32; ACTION_LEN], SimulatorError> {
+    pub fn expert_action(&self) -> Result<ActionValues, SimulatorError> {
         self.call("asking the expert", "ask_expert", ())?;
         let mut action = [0.0; ACTION_LEN];
         Python::attach(|py| {

@@ -33,7 +33,7 @@ struct Place {
     sequence: u64,
     episode: u64,
     step: u32,
-    executed: [f32; ACTION_LEN],
+    executed: ActionValues,
     held: bool,
     pushed: bool,
     scheduled_ns: u64,
@@ -49,10 +49,10 @@ struct Published {
 }
 
 /// An answer to the present observation, fit to be executed; `None` when there was none.
-type Answer = Option<[f32; ACTION_LEN]>;
+type Answer = Option<ActionValues>;
 
 /// The hand stays where it is, for actions are displacements; the gripper goes on with what it does.
-fn at_rest([_, _, _, grip]: [f32; ACTION_LEN]) -> [f32; ACTION_LEN] {
+fn at_rest([_, _, _, grip]: ActionValues) -> ActionValues {
     [0.0, 0.0, 0.0, grip]
 }
 

@@ -58,8 +58,8 @@ fn run<T: Send + 'static>(
     (tally, controller.join().unwrap())
 }
 
-fn action(answers: u64, action: [f32; ACTION_LEN]) -> Action {
-    Action { answers, published_ns: 0, source: ActionSource::Policy as u32, reserved: 0, action }
+fn action(answers: u64, action: ActionValues) -> Action {
+    Action { answers, published_ns: 0, source: ActionSource::Policy as u32, action }
 }
 
 fn next(link: &ControllerLink) -> Option<Box<Observation>> {
@@ -84,7 +84,7 @@ fn meet(settings: LinkSettings) -> (ControllerLink, Box<Observation>) {
 }
 
 /// Answers everything with `decide` until the simulator closes; returns what it saw for the first time.
-fn answer_all(link: &ControllerLink, decide: impl Fn(&Observation) -> [f32; ACTION_LEN]) -> Vec<Observation> {
+fn answer_all(link: &ControllerLink, decide: impl Fn(&Observation) -> ActionValues) -> Vec<Observation> {
     let mut seen: Vec<Observation> = Vec::new();
     while let Some(observation) = next(link) {
         if seen.last().is_none_or(|last| last.sequence != observation.sequence) {
@@ -95,7 +95,7 @@ fn answer_all(link: &ControllerLink, decide: impl Fn(&Observation) -> [f32; ACTI
     seen
 }
 
-fn decision(observation: &Observation) -> [f32; ACTION_LEN] {
+fn decision(observation: &Observation) -> ActionValues {
     [observation.sequence as f32 / 20.0, -0.5, 3.0, 0.25]
 }
 
@@ -237,7 +237,7 @@ fn moved_until_left(
     })
 }
 
-const AT_REST: [f32; ACTION_LEN] = [0.0, 0.0, 0.0, 0.75];
+const AT_REST: ActionValues = [0.0, 0.0, 0.0, 0.75];
 
 #[test]
 fn in_real_time_the_robot_rests_once_its_controller_has_said_that_it_leaves() {

@@ -16,7 +16,7 @@ use super::observer::{await_robot, observation_of};
 use super::{Ipc, LinkError, LinkSettings, Wait};
 use crate::interface::{Interface, Mismatch};
 use crate::wire::clock::monotonic_ns;
-use crate::wire::{Action, ActionHeader, Format, Observation, ObservationHeader};
+use crate::wire::{Action, ActionHeader, Format, ObservationSample, ObservationHeader};
 
 /// Everything in which a robot is not what a controller needs; empty where it fits.
 pub type Needs = Box<dyn Fn(&Interface) -> Vec<Mismatch> + Send>;
@@ -111,7 +111,7 @@ impl ControllerLink {
     ///
     /// # Errors
     /// Those of [`Self::wait_observation_polling`].
-    pub fn wait_observation(&self, timeout: Duration) -> Result<Wait<Observation>, LinkError> {
+    pub fn wait_observation(&self, timeout: Duration) -> Result<Wait<ObservationSample>, LinkError> {
         self.wait_observation_polling(self.settings.spin, timeout)
     }
 
@@ -123,7 +123,7 @@ impl ControllerLink {
         &self,
         spin: Duration,
         timeout: Duration,
-    ) -> Result<Wait<Observation>, LinkError> {
+    ) -> Result<Wait<ObservationSample>, LinkError> {
         let start = Instant::now();
         let Some(robot) = self.find_robot(timeout)? else { return Ok(Wait::TimedOut) };
         let left = timeout.saturating_sub(start.elapsed());
@@ -138,7 +138,7 @@ impl ControllerLink {
     ///
     /// # Errors
     /// [`LinkError::Traffic`].
-    pub fn poll_observation(&self) -> Result<Option<Observation>, LinkError> {
+    pub fn poll_observation(&self) -> Result<Option<ObservationSample>, LinkError> {
         let Some(robot) = self.robot.get() else { return Ok(None) };
         robot.observations.poll()?.map(|sample| observation_of(sample, &robot.format)).transpose()
     }

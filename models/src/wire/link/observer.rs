@@ -11,7 +11,7 @@ use super::direction::{Direction, Received, Receiver, Topic};
 use super::domain::join;
 use super::{Ipc, LinkError, LinkSettings, Wait};
 use crate::interface::Interface;
-use crate::wire::{Action, ActionHeader, ActionValues, Format, Observation, ObservationHeader};
+use crate::wire::{Action, ActionHeader, ActionValues, Format, ObservationSample, ObservationHeader};
 
 /// How often a robot that is not there yet, or did not listen, is asked again.
 const ASK_EVERY: Duration = Duration::from_millis(250);
@@ -34,10 +34,10 @@ pub(super) fn await_robot(inquirer: &Inquirer, timeout: Duration) -> Result<Opti
 pub(super) fn observation_of(
     sample: Received<ObservationHeader>,
     format: &Arc<Format>,
-) -> Result<Observation, LinkError> {
+) -> Result<ObservationSample, LinkError> {
     let expected = format.layout().observation_bytes;
     let wrong = |found| LinkError::MessageLength { service: "observation", found, expected };
-    Observation::of_sample(sample, format).map_err(wrong)
+    ObservationSample::new(sample, format).map_err(wrong)
 }
 
 pub(super) fn action_of(sample: &Received<ActionHeader>, format: &Format) -> Result<Action, LinkError> {
@@ -107,7 +107,7 @@ impl ObserverLink {
     ///
     /// # Errors
     /// [`LinkError::Traffic`].
-    pub fn wait_observation(&self, timeout: Duration) -> Result<Wait<Observation>, LinkError> {
+    pub fn wait_observation(&self, timeout: Duration) -> Result<Wait<ObservationSample>, LinkError> {
         let start = Instant::now();
         let Some((format, observations)) = self.0.find(timeout)? else { return Ok(Wait::TimedOut) };
         let left = timeout.saturating_sub(start.elapsed());

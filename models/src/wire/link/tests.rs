@@ -61,7 +61,7 @@ fn an_observation_goes_over_and_its_answer_comes_back() {
             panic!("no observation")
         };
         assert_eq!((observation.sequence, observation.captured_ns[0]), (7, 3));
-        assert_eq!((observation.state()[1], observation.image(0)[5]), (0.25, 9));
+        assert_eq!((observation.view().state()[1], observation.view().image(0)[5]), (0.25, 9));
         assert!(observation.published_ns > 0);
         let mut numbers = format.zeros();
         numbers.fill(0.5);

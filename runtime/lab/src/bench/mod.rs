@@ -66,7 +66,7 @@ struct Runner {
     telemetry: Telemetry,
     /// What was measured before the measurement.
     warm_up: Telemetry,
-    executed: Option<[f32; ACTION_LEN]>,
+    executed: Option<ActionValues>,
     helper_late: u64,
 }
 

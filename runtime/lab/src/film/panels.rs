@@ -48,7 +48,7 @@ impl Decoded {
 pub(super) struct Shown<'a> {
     pub(super) image: &'a [u8],
     pub(super) decoded: Option<&'a Decoded>,
-    pub(super) action: [f32; ACTION_LEN],
+    pub(super) action: ActionValues,
     pub(super) source: u32,
     pub(super) step: u32,
     pub(super) return_sum: f64,

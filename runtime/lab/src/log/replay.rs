@@ -34,7 +34,7 @@ pub struct Replayer {
     /// What the safety filter let through last is in the log.
     last_sent_known: bool,
     /// What the policy decided last in this tick.
-    decided: Option<[f32; ACTION_LEN]>,
+    decided: Option<ActionValues>,
     /// The last states, by their checksums: the controller may go back to one of them.
     states: VecDeque<(u32, State)>,
 }

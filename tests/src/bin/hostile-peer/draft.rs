@@ -147,7 +147,7 @@ pub(crate) enum Executed {
     /// The last one on the wire.
     AsSent,
     /// This one.
-    Given([f32; ACTION_LEN]),
+    Given(ActionValues),
     /// The last one on the wire with one component replaced.
     Spoilt(usize, f32),
 }
@@ -185,7 +185,7 @@ pub(crate) struct Counts {
     pub(crate) episode: u64,
     pub(crate) step: u32,
     /// The last action on the wire.
-    pub(crate) sent: [f32; ACTION_LEN],
+    pub(crate) sent: ActionValues,
 }
 
 fn hard(rng: &mut ChaCha8Rng) -> u64 {

@@ -10,7 +10,7 @@ use std::time::Duration;
 
 use rand::{Rng, SeedableRng};
 use rand_chacha::ChaCha8Rng;
-use rcwm_models::wire::{Action, ControllerLink, LinkError, ObservationSample, Wait};
+use rcwm_models::wire::{Action, ControllerLink, LinkError, Observation, Wait};
 use rcwm_runtime::controller::{Tick, TickObserver, Transport};
 
 use crate::asking::{Asking, Said};
@@ -233,9 +233,9 @@ impl World {
         }
     }
 
-    fn received(&mut self, sample: &ObservationSample, polled: bool) {
+    fn received(&mut self, sample: &Observation, polled: bool) {
         self.waiting = None;
-        self.judge.received(Heard::new(sample.origin().value(), sample.payload(), self.now_ns), polled);
+        self.judge.received(Heard::new(sample.origin(), sample.payload(), self.now_ns), polled);
     }
 
     fn sent(&mut self) {
@@ -272,7 +272,7 @@ impl Transport for Stage {
         self.world.borrow_mut().clock()
     }
 
-    fn wait(&self, _spin: Duration, timeout: Duration) -> Result<Wait<ObservationSample>, LinkError> {
+    fn wait(&self, _spin: Duration, timeout: Duration) -> Result<Wait<Observation>, LinkError> {
         let mut world = self.world.borrow_mut();
         let waited = match world.wait(timeout) {
             Waited::Nothing => return Ok(Wait::TimedOut),
@@ -290,7 +290,7 @@ impl Transport for Stage {
         Ok(waited)
     }
 
-    fn poll(&self) -> Result<Option<ObservationSample>, LinkError> {
+    fn poll(&self) -> Result<Option<Observation>, LinkError> {
         let mut world = self.world.borrow_mut();
         let until_ns = world.now_ns + 200;
         world.pass(until_ns);

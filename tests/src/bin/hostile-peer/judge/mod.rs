@@ -23,7 +23,7 @@ pub(crate) use heard::Heard;
 use crate::bundles::Known;
 use crate::scenario::Setup;
 
-type Vector = [f32; ACTION_LEN];
+type Vector = ActionValues;
 
 /// Something that must not happen.
 #[derive(Debug, Clone)]

@@ -56,7 +56,7 @@ fn hear(judge: &mut Judge, message: &Observation) {
 }
 
 fn action(answers: u64, source: ActionSource, value: f32) -> Action {
-    Action { answers, published_ns: 0, source: source as u32, reserved: 0, action: [value; ACTION_LEN] }
+    Action { answers, published_ns: 0, source: source as u32, action: [value; ACTION_LEN] }
 }
 
 fn send(judge: &mut Judge, action: Action, now_ns: u64) {
