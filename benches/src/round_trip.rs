@@ -11,7 +11,9 @@ use std::process::{Command, Stdio};
 use std::time::{Duration, Instant};
 
 use hdrhistogram::Histogram;
-use rcwm_models::wire::{Action, ControllerLink, LinkSettings, SimulatorLink, Wait, forget_prefix};
+use rcwm_models::wire::{
+    Action, ActionValues, ControllerLink, Format, LinkSettings, SimulatorLink, Wait, forget_prefix,
+};
 
 const BLOCKS: u64 = 20;
 const PATIENCE: Duration = Duration::from_secs(10);
@@ -37,8 +39,11 @@ fn main() -> Result<(), Failure> {
 
 /// The controller's process: answers whatever comes, in the order in which `measure` asks.
 fn answer(prefix: &str, rounds_per_block: u64) -> Result<(), Failure> {
-    let polling = ControllerLink::open(settings(prefix, "polling", SPIN))?;
-    let blocking = ControllerLink::open(settings(prefix, "blocking", Duration::ZERO))?;
+    let polling = ControllerLink::open(settings(prefix, "polling", SPIN), |_| Vec::new())?;
+    let blocking = ControllerLink::open(settings(prefix, "blocking", Duration::ZERO), |_| Vec::new())?;
+    for link in [&polling, &blocking] {
+        link.wait_robot(PATIENCE)?.ok_or("no robot came")?;
+    }
     let (mut input, mut output) = (std::io::stdin(), std::io::stdout());
     output.write_all(b"!")?;
     output.flush()?;
@@ -48,8 +53,8 @@ fn answer(prefix: &str, rounds_per_block: u64) -> Result<(), Failure> {
                 let Wait::Message(observation) = link.wait_observation(PATIENCE)? else {
                     return Err("no observation came".into());
                 };
-                let answers = observation.payload().sequence;
-                link.send(Action { answers, published_ns: 0, source: 0, reserved: 0, action: [0.0; 4] })?;
+                let (answers, action) = (observation.sequence, ActionValues::zeros(4));
+                link.send(&Action { answers, published_ns: 0, source: 0, action })?;
             }
         }
         let mut byte = [0];
@@ -64,8 +69,9 @@ fn answer(prefix: &str, rounds_per_block: u64) -> Result<(), Failure> {
 
 fn measure(rounds_per_block: u64, json: Option<&str>) -> Result<(), Failure> {
     let prefix = format!("rcwm_bench{}_", std::process::id());
-    let polling = SimulatorLink::open(settings(&prefix, "polling", SPIN))?;
-    let blocking = SimulatorLink::open(settings(&prefix, "blocking", Duration::ZERO))?;
+    let format = Format::metaworld();
+    let polling = SimulatorLink::open(settings(&prefix, "polling", SPIN), &format)?;
+    let blocking = SimulatorLink::open(settings(&prefix, "blocking", Duration::ZERO), &format)?;
     let mut child = Command::new(std::env::current_exe()?)
         .args(["controller", &prefix, &rounds_per_block.to_string()])
         .stdin(Stdio::piped())
@@ -74,6 +80,12 @@ fn measure(rounds_per_block: u64, json: Option<&str>) -> Result<(), Failure> {
     let mut to_child = child.stdin.take().ok_or("the child has an input")?;
     let mut from_child = child.stdout.take().ok_or("the child has an output")?;
     let mut byte = [0];
+    // It asks for the interface.
+    for link in [&polling, &blocking] {
+        while !link.poll_events()?.hello {
+            std::thread::sleep(Duration::from_millis(1));
+        }
+    }
     from_child.read_exact(&mut byte)?;
     // The controller has announced itself; a wait would end early to say so.
     polling.poll_events()?;

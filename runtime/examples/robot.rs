@@ -13,10 +13,11 @@ use std::time::{Duration, Instant};
 
 use anyhow::Context;
 use clap::Parser;
-use rcwm_models::ACTION_LEN;
 use rcwm_models::tasks::OWN_TASK;
 use rcwm_models::wire::clock::monotonic_ns;
-use rcwm_models::wire::{Action, LinkSettings, Observation, ObservationFlags, SimulatorLink, Wait};
+use rcwm_models::wire::{
+    Action, ActionValues, Format, LinkSettings, ObservationFlags, OwnedObservation, SimulatorLink, Wait,
+};
 use table::Table;
 
 /// A hand that slides over a table.
@@ -41,7 +42,7 @@ struct Arguments {
 
 fn main() -> anyhow::Result<()> {
     let arguments = Arguments::parse();
-    let link = SimulatorLink::open(LinkSettings::new(&arguments.instance))?;
+    let link = SimulatorLink::open(LinkSettings::new(&arguments.instance), &Format::metaworld())?;
     let period_ns = if arguments.rate_hz > 0.0 { (1e9 / arguments.rate_hz) as u64 } else { 0 };
     let mut robot = Robot {
         link,
@@ -77,10 +78,10 @@ struct Robot {
 impl Robot {
     fn episode(&mut self, episode: u64, steps: u32) -> anyhow::Result<f64> {
         let mut table = Table::new(episode);
-        let mut executed = [0.0; ACTION_LEN];
+        let mut executed = ActionValues::zeros(4);
         let (mut total_reward, mut held) = (0.0, false);
         for step in 0..steps {
-            let mut observation = Observation::zeroed();
+            let mut observation = OwnedObservation::zeroed(self.link.format());
             observation.sequence = self.sequence;
             (observation.episode, observation.step, observation.task) = (episode, step, OWN_TASK);
             observation.flags = ObservationFlags::default()
@@ -89,18 +90,19 @@ impl Robot {
                 .with(ObservationFlags::ACTION_HELD, held)
                 .0;
             observation.reward = if step == 0 { 0.0 } else { table.reward() };
-            observation.executed_action = executed;
-            observation.image = table.picture();
+            let mut edited = observation.edit();
+            edited.executed().copy_from_slice(&executed);
+            table.draw(edited.image(0));
             total_reward += f64::from(observation.reward);
             // What is no number is no answer, whoever sent it.
             let answer = self.ask(observation)?.map(|answer| answer.action);
-            let answer = answer.filter(|action| action.iter().all(|value| value.is_finite()));
+            let answer = answer.filter(ActionValues::is_finite);
             held = answer.is_none();
             self.held += u64::from(held);
             let action = match answer {
-                Some(action) => action.map(|value| value.clamp(-1.0, 1.0)),
+                Some(action) => action.iter().map(|value| value.clamp(-1.0, 1.0)).collect(),
                 // Nobody steers any more. The hand moves by its actions, so that it rests with zeros; an arm holds its position.
-                None if self.abandoned => [0.0; ACTION_LEN],
+                None if self.abandoned => ActionValues::zeros(4),
                 // Without an answer the last action goes on.
                 None => executed,
             };
@@ -110,14 +112,14 @@ impl Robot {
     }
 
     /// Publishes an observation and waits for its answer: to the end of the period, or as long as it takes.
-    fn ask(&mut self, mut observation: Observation) -> anyhow::Result<Option<Action>> {
+    fn ask(&mut self, mut observation: OwnedObservation) -> anyhow::Result<Option<Action>> {
         self.sequence += 1;
         observation.period_ns = self.period_ns;
         observation.scheduled_ns = self.due_ns.max(monotonic_ns());
         // The first of all waits for a controller: the clock starts with its answer.
         let waits = self.period_ns == 0 || observation.sequence == 0;
         self.due_ns = observation.scheduled_ns + self.period_ns;
-        self.link.publish(|slot| *slot = observation)?;
+        self.link.publish_copy(&observation)?;
         let start = Instant::now();
         let mut answer = None;
         loop {
@@ -138,7 +140,7 @@ impl Robot {
                 // A controller that has just connected has not seen it.
                 (Wait::TimedOut, events) if events.hello => {
                     observation.flags |= ObservationFlags::REPEATED.0;
-                    self.link.publish(|slot| *slot = observation)?;
+                    self.link.publish_copy(&observation)?;
                 }
                 _ => {}
             }

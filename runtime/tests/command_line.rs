@@ -177,7 +177,7 @@ fn a_run_that_nobody_talks_to_ends_with_its_own_exit_code() {
 fn a_peer_that_falls_silent_ends_the_run_with_its_own_exit_code_and_what_was_granted_is_in_the_json() {
     let link = own_link();
     let peer = link.peer();
-    peer.publish(|slot| *slot = observation(0, 0)).unwrap();
+    peer.publish_copy(&observation(0, 0)).unwrap();
     let json = tempfile::NamedTempFile::new().unwrap();
     let mut command = runtime();
     command.env("RCWM_PREFIX", link.prefix());
@@ -200,7 +200,7 @@ fn a_peer_that_falls_silent_ends_the_run_with_its_own_exit_code_and_what_was_gra
     while !peer.poll_events().unwrap().hello {
         std::thread::sleep(Duration::from_millis(5));
     }
-    peer.publish(|slot| *slot = observation(0, 0)).unwrap();
+    peer.publish_copy(&observation(0, 0)).unwrap();
     let error = answering.join().unwrap();
     assert!(error.contains("has been silent for 0.3 s"), "{error}");
     let report: serde_json::Value = serde_json::from_slice(&std::fs::read(json.path()).unwrap()).unwrap();
@@ -271,7 +271,7 @@ fn what_cannot_be_written_hides_neither_how_the_run_ended_nor_what_else_failed()
     // Both could be written when the run began.
     std::fs::remove_dir_all(&place).unwrap();
     std::fs::write(&place, b"a file in the folder's place").unwrap();
-    peer.publish(|slot| *slot = observation(0, 0)).unwrap();
+    peer.publish_copy(&observation(0, 0)).unwrap();
     let text = String::from_utf8(answering.join().unwrap().stderr).unwrap();
     let errors: Vec<_> = text.lines().filter(|line| line.starts_with("error: ")).collect();
     assert_eq!(errors.len(), 3, "{text}");

@@ -3,6 +3,7 @@
 #![allow(clippy::unwrap_used, reason = "a test that fails panics")]
 
 use rcwm_models::bundle::{Bundle, PartName};
+use rcwm_models::wire::ActionValues;
 use rcwm_runtime::compile::{Optimizations, compile};
 use rcwm_runtime::engine::{EngineKind, Form};
 use rcwm_runtime::policy::Sampling;
@@ -56,7 +57,7 @@ fn every_optimization_gives_what_the_exported_parts_give() {
     let mut others =
         [none, norms, convolutions, layers, Optimizations::EXACT].map(|o| policy(&bundle, with(o)));
     for step in 0..40 {
-        let executed = [0.2, -0.5, (step as f32).sin(), 1.0];
+        let executed = ActionValues::from([0.2, -0.5, (step as f32).sin(), 1.0]);
         let executed = (step % 20 > 0).then_some(&executed);
         let expected = exported.observe(&image(step), executed).unwrap();
         for (index, other) in others.iter_mut().enumerate() {
@@ -81,10 +82,11 @@ fn one_thread_and_two_give_the_same_bits() {
     let settings = with(Optimizations::EXACT);
     let (mut one, mut two) = (policy(&bundle, settings), policy(&bundle, settings.with_threads(2)));
     for step in 0..200 {
-        let executed = (step > 0).then_some(&[0.1; 4]);
+        let executed = (step > 0).then(|| ActionValues::from([0.1; 4]));
+        let executed = executed.as_ref();
         let (one, two) = (one.observe(&image(step), executed), two.observe(&image(step), executed));
         let (one, two) = (one.unwrap(), two.unwrap());
-        assert_eq!(one.action.map(f32::to_bits), two.action.map(f32::to_bits), "step {step}");
+        assert_eq!(one.action.to_bits(), two.action.to_bits(), "step {step}");
         assert_eq!(one.surprise, two.surprise);
     }
 }
@@ -97,10 +99,10 @@ fn warming_the_caches_changes_no_bit_of_what_follows() {
         let settings = with(Optimizations::EXACT).with_threads(threads);
         let (mut plain, mut warmed) = (policy(&bundle, settings), policy(&bundle, settings));
         for step in 0..60 {
-            let executed = [0.1, (step as f32).cos(), -0.4, 0.0];
+            let executed = ActionValues::from([0.1, (step as f32).cos(), -0.4, 0.0]);
             let tick = |policy: &mut Policy, warms_caches: bool| {
                 // Ahead for what is executed, or for something else; before or after getting ready.
-                let ahead = if step % 3 == 0 { [0.7; 4] } else { executed };
+                let ahead = if step % 3 == 0 { [0.7; 4].into() } else { executed };
                 if step > 0 && step % 2 == 0 {
                     policy.work_ahead(Some(&ahead)).unwrap();
                 }
@@ -113,7 +115,7 @@ fn warming_the_caches_changes_no_bit_of_what_follows() {
                 }
             };
             let (expected, found) = (tick(&mut plain, false), tick(&mut warmed, true));
-            assert_eq!(found.action.map(f32::to_bits), expected.action.map(f32::to_bits), "step {step}");
+            assert_eq!(found.action.to_bits(), expected.action.to_bits(), "step {step}");
             assert_eq!((found.surprise, found.recomputed), (expected.surprise, expected.recomputed));
             assert_eq!(warmed.state(), plain.state(), "step {step}");
         }
@@ -135,13 +137,13 @@ fn a_second_thread_that_is_late_is_done_without_and_changes_no_bit() {
                 let policy = if step % 40 == 0 { libc::SCHED_IDLE } else { libc::SCHED_OTHER };
                 starve_helpers(starved, policy, &all);
             }
-            let executed = [0.1, (step as f32).cos(), -0.4, 0.0];
+            let executed = ActionValues::from([0.1, (step as f32).cos(), -0.4, 0.0]);
             let executed = (step > 0).then_some(&executed);
             let expected = alone.observe(&image(step), executed).unwrap();
             let found = beside.observe(&image(step), executed).unwrap();
             late += u32::from(starved && found.helper_late);
             assert!(!expected.helper_late);
-            assert_eq!(found.action.map(f32::to_bits), expected.action.map(f32::to_bits), "step {step}");
+            assert_eq!(found.action.to_bits(), expected.action.to_bits(), "step {step}");
             assert_eq!(beside.state(), alone.state(), "step {step}");
         }
         // Of the hundred ticks with SCHED_IDLE; how often it is late otherwise depends on what else the machine does.
@@ -184,7 +186,7 @@ fn imagined_frames_agree_with_the_exported_parts() {
     let mut exported = policy(&bundle, settings.with_form(Form::Exported));
     let mut compiled = policy(&bundle, settings);
     for step in 0..30 {
-        let executed = [0.3; 4];
+        let executed = ActionValues::from([0.3; 4]);
         let tick = |policy: &mut Policy| match step % 3 {
             0 => policy.observe(&image(step), (step > 0).then_some(&executed)).unwrap(),
             _ => policy.imagine(&executed).unwrap(),

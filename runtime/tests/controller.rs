@@ -24,7 +24,8 @@ fn every_observation_is_answered_with_what_the_policy_decides() {
         sent.episode = sequence / 20;
         sent.flags |= if step == 19 { ObservationFlags::LAST.0 } else { 0 };
         let action = ask(&peer, &sent);
-        let expected = policy.observe(&image(step), (step > 0).then_some(&sent.executed_action)).unwrap();
+        let expected =
+            policy.observe(&image(step), (step > 0).then_some(&sent.view().executed_action())).unwrap();
         assert_eq!(action.action, expected.action, "sequence {sequence}");
         assert_eq!(action.source, ActionSource::Policy as u32);
     }
@@ -62,7 +63,7 @@ fn a_stale_observation_is_dropped_and_a_gap_is_counted() {
     ask(&peer, &observation(0, 0));
     ask(&peer, &observation(4, 4));
     let stale = observation(2, 2);
-    peer.publish(|slot| *slot = stale).unwrap();
+    peer.publish_copy(&stale).unwrap();
     // The next answer comes after the stale one was looked at, or replaced it unseen.
     std::thread::sleep(std::time::Duration::from_millis(200));
     ask(&peer, &observation(5, 5));
@@ -83,7 +84,7 @@ fn an_output_that_is_not_finite_never_reaches_the_wire() {
         for sequence in 0..3 {
             let sent = observation(sequence, sequence as u32);
             let action = ask(&peer, &sent);
-            let held = (ActionSource::Fallback as u32, sent.executed_action);
+            let held = (ActionSource::Fallback as u32, sent.view().executed_action());
             assert_eq!((action.source, action.action), held, "{part}");
         }
         peer.close().unwrap();
@@ -100,10 +101,10 @@ fn an_observation_that_is_not_finite_is_refused_and_the_last_action_held() {
         let controller = start_controller(&smallest_bundle(), &link, fallback);
         let good = ask(&peer, &observation(0, 0));
         let mut bad = observation(1, 1);
-        bad.proprioception[3] = f32::NAN;
+        bad.edit().state()[3] = f32::NAN;
         let answer = ask(&peer, &bad);
         assert_eq!(answer.source, ActionSource::Fallback as u32);
-        assert_eq!(answer.action, if held { good.action } else { [0.0; 4] });
+        assert_eq!(answer.action, if held { good.action } else { [0.0; 4].into() });
         assert_eq!(ask(&peer, &observation(2, 2)).source, ActionSource::Policy as u32);
         peer.close().unwrap();
         assert_eq!(controller.join().unwrap().counters.refused_observations, 1);
@@ -113,8 +114,7 @@ fn an_observation_that_is_not_finite_is_refused_and_the_last_action_held() {
 #[test]
 fn the_bundle_s_action_limits_hold_for_every_source() {
     let narrow = with_manifest(|manifest| {
-        manifest.control.action_low = [0.25, -0.001, -1.0, -1.0];
-        manifest.control.action_high = [0.5, 0.001, -0.75, -0.9];
+        rcwm_testkit::limit(manifest, [0.25, -0.001, -1.0, -1.0], [0.5, 0.001, -0.75, -0.9]);
     });
     let link = own_link();
     let peer = link.peer();
@@ -184,7 +184,7 @@ fn work_ahead_is_done_once_a_tick_and_again_where_another_action_was_executed() 
         sent = observation(sequence, sequence as u32);
         // Every other time what was asked for is what was executed.
         if sequence % 2 == 0 {
-            sent.executed_action = answer.action;
+            sent.edit().executed().copy_from_slice(&answer.action);
         }
     }
     ask(&peer, &sent);

@@ -9,7 +9,7 @@ use std::thread::JoinHandle;
 
 use rcwm_models::episode::Episode;
 use rcwm_models::tasks::task_id;
-use rcwm_models::wire::{Observation, ObservationFlags, SimulatorLink};
+use rcwm_models::wire::{Format, ObservationFlags, OwnedObservation, SimulatorLink};
 use rcwm_testkit::{OwnLink, ask, observation, own_link, smallest_bundle};
 
 /// Standard output whose reader is gone.
@@ -41,11 +41,11 @@ struct Robot {
 }
 
 impl Robot {
-    fn playing(steps: u32, change: impl Fn(&mut Observation) + Send + 'static) -> Self {
+    fn playing(steps: u32, change: impl Fn(&mut OwnedObservation) + Send + 'static) -> Self {
         let link = own_link();
         let settings = link.0.clone();
         let play = move || {
-            let peer = SimulatorLink::open(settings).unwrap();
+            let peer = SimulatorLink::open(settings, &Format::metaworld()).unwrap();
             for step in 0..steps {
                 let mut sent = observation(u64::from(step), step);
                 sent.reward = 1.0;

@@ -2,7 +2,7 @@
 
 #![allow(clippy::unwrap_used, reason = "a test that fails panics")]
 
-use rcwm_models::wire::Action;
+use rcwm_models::wire::{Action, ActionValues};
 use rcwm_runtime::controller::{Counters, EpisodeResult, Episodes, State, Tick, TickObserver, TickTimes};
 use rcwm_runtime::log::{LogSettings, LogWriter};
 use rcwm_runtime::policy::Sampling;
@@ -27,17 +27,12 @@ fn a_record_allocates_nothing_in_the_loop_s_thread() {
         let mut observation = observation(u64::from(step), step);
         // Real time: full buffers are no reason to wait.
         observation.period_ns = 1_000_000;
-        let executed = (step > 0).then_some(&[0.1; 4]);
-        let decision = policy.observe(&observation.image, executed).unwrap();
+        let executed = (step > 0).then(|| ActionValues::from([0.1; 4]));
+        let decision = policy.observe(observation.view().image(0), executed.as_ref()).unwrap();
         Stage::ALL.into_iter().for_each(|stage| telemetry.record(stage, 1000));
-        let answer = Action {
-            answers: u64::from(step),
-            published_ns: 3,
-            source: 0,
-            action: decision.action,
-        };
+        let answer = Action { answers: u64::from(step), published_ns: 3, source: 0, action: decision.action };
         let tick = Tick {
-            observation: Some(&observation),
+            observation: Some(&observation.view()),
             is_first: step == 0,
             rewound: false,
             decision: Some(decision),

@@ -4,15 +4,20 @@
 
 use rcwm_models::IMAGE_BYTES;
 use rcwm_models::bundle::{Bundle, PartName};
+use rcwm_models::wire::ActionValues;
 use rcwm_runtime::policy::Sampling;
 use rcwm_runtime::{EngineError, EngineSettings, Policy, PolicyError};
 use rcwm_testkit::{image, smallest_bundle, with_nan_weight};
 
 const EXECUTED: [f32; 4] = [0.1, -0.4, 0.2, -1.0];
 
-fn run(policy: &mut Policy, steps: u32) -> Vec<[f32; 4]> {
+fn executed_values() -> ActionValues {
+    EXECUTED.into()
+}
+
+fn run(policy: &mut Policy, steps: u32) -> Vec<ActionValues> {
     (0..steps)
-        .map(|step| policy.observe(&image(step), (step > 0).then_some(&EXECUTED)).unwrap().action)
+        .map(|step| policy.observe(&image(step), (step > 0).then(executed_values).as_ref()).unwrap().action)
         .collect()
 }
 
@@ -30,10 +35,10 @@ fn the_executed_action_matters_except_at_the_first_of_an_episode() {
     let start = policy.state().clone();
     policy.observe(&image(0), None).unwrap();
     assert_eq!(*policy.state(), start);
-    policy.observe(&image(1), Some(&EXECUTED)).unwrap();
+    policy.observe(&image(1), Some(&executed_values())).unwrap();
     let moved = policy.state().clone();
     policy.set_state(&start).unwrap();
-    policy.observe(&image(1), Some(&[1.0; 4])).unwrap();
+    policy.observe(&image(1), Some(&[1.0; 4].into())).unwrap();
     assert_ne!(policy.state().robot.h, moved.robot.h);
 }
 
@@ -55,9 +60,9 @@ fn what_is_invalid_is_refused_and_leaves_the_state_alone() {
     let mut policy = Policy::load(&smallest_bundle(), EngineSettings::tract()).unwrap();
     run(&mut policy, 3);
     let before = policy.state().clone();
-    let short = policy.observe(&[0; IMAGE_BYTES - 1], Some(&EXECUTED));
+    let short = policy.observe(&[0; IMAGE_BYTES - 1], Some(&executed_values()));
     assert!(matches!(short, Err(PolicyError::Observation(_))));
-    let infinite = policy.observe(&image(3), Some(&[f32::INFINITY, 0.0, 0.0, 0.0]));
+    let infinite = policy.observe(&image(3), Some(&[f32::INFINITY, 0.0, 0.0, 0.0].into()));
     assert!(matches!(infinite, Err(PolicyError::Observation(_))));
     assert_eq!(*policy.state(), before);
 }
@@ -83,15 +88,16 @@ fn work_done_ahead_changes_nothing_but_when_it_is_done() {
         let expected = run(&mut fresh(), 8);
         let mut ahead = fresh();
         for (step, expected) in (0..).zip(&expected) {
-            let executed = (step > 0).then_some(&EXECUTED);
+            let executed = (step > 0).then(executed_values);
+            let executed = executed.as_ref();
             ahead.work_ahead(executed).unwrap();
             let decision = ahead.observe(&image(step), executed).unwrap();
             assert_eq!((decision.action, decision.recomputed), (*expected, false));
         }
         let mut wrong = fresh();
         for (step, expected) in (0..).zip(&expected) {
-            wrong.work_ahead((step > 0).then_some(&[-0.9; 4])).unwrap();
-            let decision = wrong.observe(&image(step), (step > 0).then_some(&EXECUTED)).unwrap();
+            wrong.work_ahead((step > 0).then_some(&[-0.9; 4].into())).unwrap();
+            let decision = wrong.observe(&image(step), (step > 0).then(executed_values).as_ref()).unwrap();
             assert_eq!((decision.action, decision.recomputed), (*expected, step > 0));
         }
     }
@@ -103,7 +109,7 @@ fn an_imagined_frame_moves_the_state_and_has_no_surprise() {
     let seen = policy.observe(&image(0), None).unwrap();
     assert!(seen.surprise.is_some_and(|surprise| surprise.robot > 0.0 && surprise.environment > 0.0));
     let before = policy.state().clone();
-    let imagined = policy.imagine(&EXECUTED).unwrap();
+    let imagined = policy.imagine(&executed_values()).unwrap();
     assert_eq!(imagined.surprise, None);
     assert_eq!(policy.state().robot.z, policy.buffers().robot.prior_z);
     assert_ne!(*policy.state(), before);

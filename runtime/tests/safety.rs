@@ -6,7 +6,7 @@ use std::sync::atomic::AtomicBool;
 use std::time::{Duration, Instant};
 
 use rcwm_models::bundle::{ActionMode, Bundle};
-use rcwm_models::wire::{ActionSource, Observation, SimulatorLink, Wait};
+use rcwm_models::wire::{ActionSource, ActionValues, OwnedObservation, SimulatorLink, Wait};
 use rcwm_runtime::controller::{
     Controller, ControllerError, ControllerSettings, Ended, Fallback, Tick, TickLimits, TickObserver,
 };
@@ -19,12 +19,12 @@ use rcwm_testkit::{
 };
 
 /// Publishes an observation of a fixed clock until it is answered, anew each time: one that a slow machine has made stale is not.
-fn ask_now(peer: &SimulatorLink, sequence: u64, change: impl Fn(&mut Observation)) {
+fn ask_now(peer: &SimulatorLink, sequence: u64, change: impl Fn(&mut OwnedObservation)) {
     let start = Instant::now();
     while start.elapsed() < NEVER {
         let mut now = due_now(sequence);
         change(&mut now);
-        peer.publish(|slot| *slot = now).unwrap();
+        peer.publish_copy(&now).unwrap();
         if let (Wait::Message(action), _) = peer.wait_action(Duration::from_millis(100)).unwrap()
             && action.answers == sequence
         {
@@ -34,9 +34,9 @@ fn ask_now(peer: &SimulatorLink, sequence: u64, change: impl Fn(&mut Observation
     panic!("observation {sequence} was not answered");
 }
 
-fn executed(sequence: u64, action: [f32; 4]) -> Observation {
+fn executed(sequence: u64, action: impl Into<ActionValues>) -> OwnedObservation {
     let mut observation = observation(sequence, sequence as u32);
-    observation.executed_action = action;
+    observation.edit().executed().copy_from_slice(&action.into());
     observation
 }
 
@@ -53,7 +53,7 @@ fn hears_closed(peer: &SimulatorLink) -> bool {
 
 /// A bundle whose actions are absolute positions.
 fn absolute() -> tempfile::TempDir {
-    with_manifest(|manifest| manifest.control.action_mode = ActionMode::Absolute)
+    with_manifest(|manifest| rcwm_testkit::set_mode(manifest, ActionMode::Absolute))
 }
 
 struct Panicking;
@@ -113,7 +113,9 @@ fn a_sequence_of_any_size_is_counted_without_an_overflow() {
         late
     };
     ask(&peer, &late(0));
-    let answer = ask(&peer, &Observation { step: 1, flags: 0, ..late(u64::MAX) });
+    let mut last = late(u64::MAX);
+    (last.step, last.flags) = (1, 0);
+    let answer = ask(&peer, &last);
     assert_eq!(answer.source, ActionSource::Policy as u32);
     // Nothing can follow it but another publisher.
     drop(peer);
@@ -140,7 +142,7 @@ fn stale_observations_in_any_number_do_not_keep_a_stand_in_from_being_sent() {
         by_turns = !by_turns;
         let mut stale = due_now(if by_turns { 1 } else { 6 });
         stale.scheduled_ns -= if by_turns { 0 } else { 10 * PERIOD_NS };
-        peer.publish(|slot| *slot = stale).unwrap();
+        peer.publish_copy(&stale).unwrap();
         if let (Wait::Message(action), _) = peer.wait_action(Duration::from_micros(300)).unwrap() {
             fell_back = action.source == ActionSource::Fallback as u32;
         }
@@ -211,7 +213,7 @@ fn a_controller_that_joins_an_episode_moves_from_what_was_executed() {
 fn what_was_executed_is_held_where_the_policy_has_nothing_fit_to_send() {
     // A surprise over its limit at every tick but the first: the observation is sound, the policy is not asked.
     for mode in [ActionMode::Delta, ActionMode::Velocity, ActionMode::Absolute] {
-        let bundle = with_manifest(|manifest| manifest.control.action_mode = mode);
+        let bundle = with_manifest(|manifest| rcwm_testkit::set_mode(manifest, mode));
         let link = own_link();
         let peer = link.peer();
         let controller = start_controller_with(bundle.path(), &link, |settings| {
@@ -220,7 +222,11 @@ fn what_was_executed_is_held_where_the_policy_has_nothing_fit_to_send() {
         ask(&peer, &observation(0, 0));
         for (sequence, action) in [(1, [0.7, -0.6, 0.5, 0.4]), (2, [0.2, 0.2, -0.2, 1.0])] {
             let answer = ask(&peer, &executed(sequence, action));
-            assert_eq!((answer.source, answer.action), (ActionSource::Fallback as u32, action), "{mode:?}");
+            assert_eq!(
+                (answer.source, answer.action),
+                (ActionSource::Fallback as u32, action.into()),
+                "{mode:?}"
+            );
         }
         peer.close().unwrap();
         controller.join().unwrap().0.unwrap();
@@ -238,13 +244,13 @@ fn a_position_is_held_across_episodes_and_never_replaced_by_zeros() {
     // Nothing is known yet: nothing is sent, and the robot stays where it is.
     let start = Instant::now();
     while start.elapsed() < Duration::from_millis(600) {
-        peer.publish(|slot| *slot = refused).unwrap();
+        peer.publish_copy(&refused).unwrap();
         let (wait, _) = peer.wait_action(Duration::from_millis(50)).unwrap();
         assert!(!matches!(wait, Wait::Message(_)), "{wait:?}");
     }
     ask(&peer, &executed(1, HELD));
     let mut refused = executed(2, HELD);
-    refused.proprioception[0] = f32::NAN;
+    refused.edit().state()[0] = f32::NAN;
     let held = ask(&peer, &refused).action;
     // The next episode begins with an observation that cannot be used, and zeros for an action that there was not.
     let mut first = executed(3, [0.0; 4]);
@@ -269,13 +275,13 @@ fn zeros_as_a_fallback_are_refused_for_positions_with_a_line_that_says_what_to_d
 }
 
 #[test]
-fn a_bundle_whose_limits_no_wire_can_carry_is_refused() {
+fn limits_of_a_policy_beyond_those_of_its_robot_are_refused() {
     for (low, high) in [(-100.0, 100.0), (-1.0, 1.5), (-1.01, 0.0), (f32::NEG_INFINITY, 0.0), (0.5, 0.5)] {
         let wide = with_manifest(|manifest| {
-            (manifest.control.action_low[2], manifest.control.action_high[2]) = (low, high);
+            rcwm_testkit::limit(manifest, [-1.0, -1.0, low, -1.0], [1.0, 1.0, high, 1.0]);
         });
         let error = Bundle::open(wide.path()).err().unwrap().to_string();
-        assert!(error.contains("action limits") && error.contains("[-1, 1]"), "{low} to {high}: {error}");
+        assert!(error.contains("policy.limits") && error.contains("-1 to 1"), "{low} to {high}: {error}");
     }
 }
 
@@ -283,13 +289,13 @@ fn a_bundle_whose_limits_no_wire_can_carry_is_refused() {
 fn limits_are_last_right_after_a_swap_under_a_rate_limit() {
     const NARROW: f32 = 0.2;
     let narrow = with_manifest(|manifest| {
-        (manifest.control.action_low, manifest.control.action_high) = ([-NARROW; 4], [NARROW; 4]);
+        rcwm_testkit::limit(manifest, [-NARROW; 4], [NARROW; 4]);
     });
     let link = own_link();
     let peer = link.peer();
     let policy = Policy::load(&smallest_bundle(), EngineSettings::tract()).unwrap();
-    let (engine, rate_hz) = (EngineSettings::tract(), policy.manifest().control.rate_hz);
-    let server = SwapSettings { link: link.0.clone(), engine, sampling: Sampling::Mode, rate_hz };
+    let (engine, interface) = (EngineSettings::tract(), policy.manifest().interface.clone());
+    let server = SwapSettings { link: link.0.clone(), engine, sampling: Sampling::Mode, interface };
     let limit = |settings: &mut ControllerSettings| settings.rate_max = Some(0.05);
     let controller = start_changed(policy, &link, limit, move |controller| {
         controller.take_swaps(Swapper::start(server).unwrap());

@@ -8,7 +8,7 @@ use std::thread::JoinHandle;
 use std::time::Duration;
 
 use rcwm_models::bundle::PartName;
-use rcwm_models::wire::{ActionSource, ObservationFlags, SimulatorLink};
+use rcwm_models::wire::{ActionSource, ActionValues, ObservationFlags, SimulatorLink};
 use rcwm_runtime::controller::{Controller, ControllerSettings, RunReport, TickLimits};
 use rcwm_runtime::policy::Sampling;
 use rcwm_runtime::swap::{Answer, SwapError, SwapSettings, Swapper, When, ask, name_of_server};
@@ -35,7 +35,7 @@ fn start_with_limits(link: &OwnLink, engine: EngineSettings, ticks: TickLimits) 
         link: link.0.clone(),
         engine,
         sampling: Sampling::Mode,
-        rate_hz: policy.manifest().control.rate_hz,
+        interface: policy.manifest().interface.clone(),
     };
     let swapper = Swapper::start(settings).unwrap();
     let change = |settings: &mut ControllerSettings| settings.ticks = ticks;
@@ -64,7 +64,7 @@ impl Peer<'_> {
     }
 
     /// One observation, and the action that answers it: the policy's own, whatever happens beside it.
-    fn tick(&mut self) -> [f32; 4] {
+    fn tick(&mut self) -> ActionValues {
         let mut observation = rcwm_testkit::observation(self.sequence, self.step());
         observation.episode = self.sequence / EPISODE;
         observation.flags |= if self.step() == 19 { ObservationFlags::LAST.0 } else { 0 };
@@ -86,11 +86,11 @@ impl Peer<'_> {
 /// The smallest bundle with other limits, so that its actions tell it from the first; golden values know no limits.
 fn other_bundle() -> tempfile::TempDir {
     with_manifest(|manifest| {
-        (manifest.control.action_low, manifest.control.action_high) = ([0.5; 4], [0.75; 4]);
+        rcwm_testkit::limit(manifest, [0.5; 4], [0.75; 4]);
     })
 }
 
-fn is_of_other(action: [f32; 4]) -> bool {
+fn is_of_other(action: ActionValues) -> bool {
     action.iter().all(|x| (0.5..=0.75).contains(x))
 }
 
@@ -125,7 +125,7 @@ fn a_bundle_taken_at_once_starts_from_its_initial_state_in_the_middle_of_an_epis
     assert!(matches!(answer, Answer::Taken { .. }), "{answer:?}");
     let mut policy = Policy::load(&smallest_bundle(), EngineSettings::tract()).unwrap();
     for step in 5..10 {
-        let executed = rcwm_testkit::observation(step, step as u32).executed_action;
+        let executed = rcwm_testkit::observation(step, step as u32).view().executed_action();
         let image = rcwm_testkit::image(step as u32);
         let expected = policy.observe(&image, (step > 5).then_some(&executed)).unwrap();
         assert_eq!(peer_ticks.tick(), expected.action, "step {step}");
@@ -158,7 +158,7 @@ fn a_bad_bundle_is_refused_with_one_line_and_the_old_one_runs_on() {
     let peer = link.peer();
     let controller = start(&link);
     let mut peer_ticks = Peer { link: &peer, sequence: 0 };
-    let slow = with_manifest(|manifest| manifest.control.rate_hz = 20.0);
+    let slow = with_manifest(|manifest| manifest.interface.rate_hz = 20.0);
     let damaged = with_manifest(|manifest| manifest.parts[1].sha256.replace_range(..1, "x"));
     let sizes = with_manifest(|manifest| manifest.model.deter *= 2);
     let action = with_manifest(|manifest| manifest.model.action = 7);

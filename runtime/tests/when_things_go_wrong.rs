@@ -9,7 +9,8 @@ use std::time::Duration;
 
 use rcwm_models::bundle::PartName;
 use rcwm_models::wire::{
-    Action, ActionSource, ControllerLink, LinkError, ObservationFlags, Observation, SimulatorLink, Wait,
+    Action, ActionSource, ActionValues, ControllerLink, LinkError, ObservationFlags, ObservationSample,
+    SimulatorLink, Wait,
 };
 use rcwm_runtime::controller::{
     Cause, Controller, ControllerError, ControllerSettings, Ended, Fallback, State, SurpriseLimits,
@@ -86,11 +87,11 @@ fn an_observation_that_comes_after_it_was_imagined_is_answered_as_if_it_had_been
         }
         let mut sent = due_now(sequence);
         sent.scheduled_ns -= 1000;
-        peer.publish(|slot| *slot = sent).unwrap();
+        peer.publish_copy(&sent).unwrap();
         let answers = |action: &Action| action.answers == sequence && is(ActionSource::Policy)(action);
         let answer = next(&peer, "policy's answer", answers);
         let expected =
-            policy.observe(&image(sequence as u32), (sequence > 0).then_some(&sent.executed_action));
+            policy.observe(&image(sequence as u32), (sequence > 0).then_some(&sent.view().executed_action()));
         assert_eq!(answer.action, expected.unwrap().action, "sequence {sequence}");
     }
     peer.close().unwrap();
@@ -109,16 +110,19 @@ fn a_peer_that_has_lost_the_answer_gets_it_again_whatever_was_imagined_since() {
     assert_eq!(first.action, policy.observe(&image(0), None).unwrap().action);
     next(&peer, "fallback", is(ActionSource::Fallback));
     // The same twice in the link is no reason to go back, the peer that says so is.
-    peer.publish(|slot| *slot = due_now(0)).unwrap();
+    peer.publish_copy(&due_now(0)).unwrap();
     let mut again = due_now(0);
     again.flags |= ObservationFlags::REPEATED.0;
     let answer = ask(&peer, &again);
     assert_eq!((answer.action, answer.source), (first.action, ActionSource::Policy as u32));
     let sent = due_now(1);
-    peer.publish(|slot| *slot = sent).unwrap();
+    peer.publish_copy(&sent).unwrap();
     let answer =
         next(&peer, "policy's answer", |action| action.answers == 1 && is(ActionSource::Policy)(action));
-    assert_eq!(answer.action, policy.observe(&image(1), Some(&sent.executed_action)).unwrap().action);
+    assert_eq!(
+        answer.action,
+        policy.observe(&image(1), Some(&sent.view().executed_action())).unwrap().action
+    );
     peer.close().unwrap();
     controller.join().unwrap().0.unwrap();
 }
@@ -128,7 +132,7 @@ fn an_answer_that_the_robot_is_too_far_from_by_now_is_the_same_whenever_it_is_as
     let link = own_link();
     let peer = link.peer();
     let controller = start_controller_with(&smallest_bundle(), &link, |settings| {
-        (settings.rate_max, settings.fallback) = (Some(0.01), Fallback::Given([1.0; 4]));
+        (settings.rate_max, settings.fallback) = (Some(0.01), Fallback::Given([1.0; 4].into()));
         settings.ticks = TickLimits { imagined_ticks_max: 0, fallback_ticks_max: 1000 };
     });
     let first = ask(&peer, &due_now(0)).action;
@@ -136,7 +140,8 @@ fn an_answer_that_the_robot_is_too_far_from_by_now_is_the_same_whenever_it_is_as
     let executed = next(&peer, "fallback", |action| action.action[0] > first[0] + 0.015).action;
     let again = || {
         let mut again = due_now(0);
-        (again.executed_action, again.flags) = (executed, again.flags | ObservationFlags::REPEATED.0);
+        again.edit().executed().copy_from_slice(&executed);
+        again.flags |= ObservationFlags::REPEATED.0;
         ask(&peer, &again).action
     };
     let second = again();
@@ -165,16 +170,16 @@ impl Transport for JustInTime {
         Transport::now_ns(&self.link)
     }
 
-    fn wait(&self, spin: Duration, timeout: Duration) -> Result<Wait<Observation>, LinkError> {
+    fn wait(&self, spin: Duration, timeout: Duration) -> Result<Wait<ObservationSample>, LinkError> {
         self.found_nothing.set(false);
         Transport::wait(&self.link, spin, timeout)
     }
 
-    fn poll(&self) -> Result<Option<Observation>, LinkError> {
+    fn poll(&self) -> Result<Option<ObservationSample>, LinkError> {
         if self.found_nothing.get() {
             let mut again = due_now(0);
             again.flags |= ObservationFlags::REPEATED.0;
-            self.peer.publish(|slot| *slot = again)?;
+            self.peer.publish_copy(&again)?;
             self.times.update(|times| times + 1);
             self.stop.store(self.times.get() > Self::TIMES, Ordering::Relaxed);
         }
@@ -183,7 +188,7 @@ impl Transport for JustInTime {
         Ok(found)
     }
 
-    fn send(&self, action: Action) -> Result<u64, LinkError> {
+    fn send(&self, action: &Action) -> Result<u64, LinkError> {
         Transport::send(&self.link, action)
     }
 
@@ -204,9 +209,9 @@ impl Transport for JustInTime {
 fn a_peer_that_says_where_it_stands_before_a_stand_in_is_sent_is_gone_back_to_as_well() {
     let own = own_link();
     let stop = Arc::<AtomicBool>::default();
-    let link = ControllerLink::open(own.0.clone()).unwrap();
+    let link = ControllerLink::open(own.0.clone(), |_| Vec::new()).unwrap();
     let (peer, found_nothing) = (own.peer(), Cell::new(false));
-    peer.publish(|slot| *slot = due_now(0)).unwrap();
+    peer.publish_copy(&due_now(0)).unwrap();
     let stage = JustInTime { link, peer, times: Cell::new(0), found_nothing, stop: Arc::clone(&stop) };
     let policy = Policy::load(&smallest_bundle(), EngineSettings::tract()).unwrap();
     let settings = ControllerSettings::new(own.0.clone());
@@ -225,7 +230,7 @@ fn an_observation_that_was_due_long_ago_is_dropped_and_counted() {
     ask(&peer, &due_now(0));
     let mut old = due_now(1);
     old.scheduled_ns -= 3 * PERIOD_NS;
-    peer.publish(|slot| *slot = old).unwrap();
+    peer.publish_copy(&old).unwrap();
     next(&peer, "imagined action", is(ActionSource::Imagined));
     let answer = ask(&peer, &due_now(9));
     assert_eq!(answer.source, ActionSource::Policy as u32);
@@ -257,7 +262,7 @@ fn a_policy_that_is_invalid_for_too_long_stops_the_run_and_says_why() {
     for sequence in 0..3 {
         assert_eq!(ask(&peer, &observation(sequence, sequence as u32)).source, ActionSource::Fallback as u32);
     }
-    peer.publish(|slot| *slot = observation(3, 3)).unwrap();
+    peer.publish_copy(&observation(3, 3)).unwrap();
     let (ended, report) = controller.join().unwrap();
     assert!(matches!(ended, Err(ControllerError::Stopped { cause: Cause::Output, ticks: 3 })), "{ended:?}");
     assert_eq!((report.ended, report.last_state), (Ended::Stopped, State::Stopped { cause: Cause::Output }));
@@ -295,16 +300,16 @@ fn the_rate_limit_holds_between_any_two_actions_on_the_wire() {
     let link = own_link();
     let peer = link.peer();
     let controller = start_controller_with(&smallest_bundle(), &link, |settings| {
-        (settings.rate_max, settings.fallback) = (Some(0.01), Fallback::Given([1.0, -1.0, 1.0, -1.0]));
+        (settings.rate_max, settings.fallback) = (Some(0.01), Fallback::Given([1.0, -1.0, 1.0, -1.0].into()));
     });
-    let mut last = [0.0_f32; 4];
+    let mut last = ActionValues::zeros(4);
     for sequence in 0..20 {
         let mut sent = observation(sequence, sequence as u32);
         sent.reward = if sequence % 5 == 4 { f32::NAN } else { 0.0 };
-        sent.executed_action = last;
+        sent.edit().executed().copy_from_slice(&last);
         let answer = ask(&peer, &sent).action;
         assert!(
-            answer.iter().zip(last).all(|(a, b)| (a - b).abs() <= 0.01 + 1e-6),
+            answer.iter().zip(last.iter()).all(|(a, b)| (a - b).abs() <= 0.01 + 1e-6),
             "{answer:?} after {last:?}"
         );
         last = answer;

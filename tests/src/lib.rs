@@ -14,7 +14,7 @@ use std::sync::atomic::{AtomicU32, Ordering};
 use std::time::{Duration, Instant};
 
 use iceoryx2::prelude::*;
-use rcwm_models::wire::{LinkSettings, Observation, ObserverLink, Wait, forget_prefix, list_leftovers};
+use rcwm_models::wire::{LinkSettings, ObservationHeader, ObserverLink, Wait, forget_prefix, list_leftovers};
 
 /// How long anything in a test may take before it counts as hung.
 pub const TIMEOUT: Duration = Duration::from_secs(120);
@@ -283,12 +283,12 @@ impl Observer {
     ///
     /// # Panics
     /// When none comes within [`TIMEOUT`].
-    pub fn wait_for(&self, mut fits: impl FnMut(&Observation) -> bool) -> u64 {
+    pub fn wait_for(&self, mut fits: impl FnMut(&ObservationHeader) -> bool) -> u64 {
         let start = Instant::now();
         while start.elapsed() < TIMEOUT {
             let wait = self.0.wait_observation(Duration::from_millis(100)).expect("the link works");
             match wait {
-                Wait::Message(sample) if fits(sample.payload()) => return sample.payload().sequence,
+                Wait::Message(sample) if fits(&sample) => return sample.sequence,
                 _ => {}
             }
         }
@@ -298,7 +298,7 @@ impl Observer {
 
 /// An observation as a version before the first would have had it.
 #[derive(Debug, Clone, Copy, ZeroCopySend)]
-#[type_name("rcwm.Observation.v0")]
+#[type_name("rcwm.Observation.v1")]
 #[repr(C)]
 struct OldObservation {
     sequence: u64,

@@ -8,7 +8,7 @@ use anyhow::Context;
 use rcwm_models::IMAGE_BYTES;
 use rcwm_models::bundle::Bundle;
 use rcwm_models::wire::clock::monotonic_ns;
-use rcwm_models::wire::{Action, ActionSource, ObservationFlags, SimulatorLink, Wait};
+use rcwm_models::wire::{Action, ActionSource, ActionValues, ObservationFlags, SimulatorLink, Wait};
 use rustix::thread::clock_nanosleep_absolute;
 use rustix::time::{ClockId, Timespec};
 use serde::Serialize;
@@ -54,7 +54,7 @@ pub struct Stream<'a> {
     period_ns: u64,
     episode: u64,
     sequence: u64,
-    last_action: [f32; 4],
+    last_action: ActionValues,
     /// When what was not answered in time was published, by sequence.
     unanswered: HashMap<u64, u64>,
 }
@@ -72,7 +72,15 @@ impl<'a> Stream<'a> {
         anyhow::ensure!((1.0..=10_000.0).contains(&rate_hz), "--rate-hz {rate_hz}: expected 1 to 10000");
         let period_ns = (1e9 / rate_hz) as u64;
         let (episode, unanswered) = (u64::from(episode), HashMap::new());
-        Ok(Self { peer, images, period_ns, episode, sequence: 0, last_action: [0.0; 4], unanswered })
+        Ok(Self {
+            peer,
+            images,
+            period_ns,
+            episode,
+            sequence: 0,
+            last_action: ActionValues::zeros(4),
+            unanswered,
+        })
     }
 
     fn publish(&mut self, scheduled_ns: u64, repeated: bool) -> anyhow::Result<()> {
@@ -86,8 +94,10 @@ impl<'a> Stream<'a> {
             (slot.sequence, slot.episode, slot.step) =
                 (self.sequence, self.sequence / self.episode, step as u32);
             (slot.scheduled_ns, slot.period_ns, slot.flags) = (scheduled_ns, self.period_ns, flags.0);
-            slot.executed_action = if step == 0 { [0.0; 4] } else { self.last_action };
-            slot.image = image;
+            if step > 0 {
+                slot.executed().copy_from_slice(&self.last_action);
+            }
+            slot.image(0).copy_from_slice(&image);
         })?;
         Ok(())
     }

@@ -81,7 +81,7 @@ fn a_python_robot_is_told_that_its_controller_has_closed() {
 fn a_python_robot_executes_no_action_that_is_not_finite_or_out_of_range() {
     let (domain, folder) = (Domain::new(), tempfile::tempdir().unwrap());
     let left = folder.path().join("simulator.json");
-    let controller = ControllerLink::open(domain.link("python")).unwrap();
+    let controller = ControllerLink::open(domain.link("python"), |_| Vec::new()).unwrap();
     let mut command = domain.python(&root().join("runtime/examples/python/simulator.py"));
     command.args(["--instance", "python", "--episodes", "1", "--steps", "3", "--json"]).arg(&left);
     let mut simulator = Running::start(command);
@@ -89,9 +89,9 @@ fn a_python_robot_executes_no_action_that_is_not_finite_or_out_of_range() {
     while let Wait::Message(observation) = controller.wait_observation(Duration::from_secs(20)).unwrap() {
         // The robot waits on: the next one may be fit.
         for bad in [f32::NAN, f32::INFINITY, 1.5, 0.5] {
-            let action = [0.0, bad, 0.0, 0.0];
+            let action = [0.0, bad, 0.0, 0.0].into();
             let answers = observation.sequence;
-            controller.send(Action { answers, published_ns: 0, source: 0, action }).unwrap();
+            controller.send(&Action { answers, published_ns: 0, source: 0, action }).unwrap();
             // Only the newest action is kept: each is to be seen.
             std::thread::sleep(Duration::from_millis(20));
         }

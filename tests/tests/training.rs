@@ -5,7 +5,7 @@ use std::path::Path;
 use std::time::{Duration, Instant};
 
 use rcwm_models::episode::{Episode, EpisodeBuilder};
-use rcwm_models::wire::{Observation, ObservationFlags};
+use rcwm_models::wire::{Format, ObservationFlags, OwnedObservation};
 use rcwm_tests::{Domain, Running, eventually, output, read_json};
 
 fn trainer(domain: &Domain, words: &[&str], out: &Path) -> std::process::Command {
@@ -166,16 +166,16 @@ fn a_simulator_that_fails_is_reported_with_its_last_words() {
 fn write_data(folder: &Path) {
     let mut builder = EpisodeBuilder::new();
     for step in 0..16_u32 {
-        let mut observation = Observation::zeroed();
+        let mut observation = OwnedObservation::zeroed(&Format::metaworld());
         observation.step = step;
         observation.flags = ObservationFlags::default()
             .with(ObservationFlags::FIRST, step == 0)
             .with(ObservationFlags::MASK_VALID, true)
             .0;
-        for (index, pixel) in observation.image.iter_mut().enumerate() {
+        for (index, pixel) in observation.edit().image(0).iter_mut().enumerate() {
             *pixel = (index * 7 + step as usize * 31) as u8;
         }
-        builder.push(&observation).unwrap();
+        builder.push(&observation.view()).unwrap();
     }
     std::fs::create_dir_all(folder.join("reach")).unwrap();
     builder.finish().unwrap().write(&folder.join("reach/noise.npz")).unwrap();

@@ -12,6 +12,7 @@ use assert_cmd::Command;
 use ndarray::{Array2, Array4};
 use rcwm_models::bundle::{Bundle, MANIFEST_FILE, PartName};
 use rcwm_models::episode::Episode;
+use rcwm_models::interface::Interface;
 use rcwm_models::onnx;
 use rcwm_models::settings::ModelKind;
 use rcwm_models::tensors::Values;
@@ -41,7 +42,7 @@ impl Progress for StopsAt {
 fn options() -> Options {
     Options {
         task: "reach".into(),
-        rate_hz: 40.0,
+        interface: Interface::metaworld(),
         parts: PartName::ALL.to_vec(),
         golden_episode: None,
         golden_ticks: 6,

@@ -16,7 +16,7 @@ use ndarray::{Array1, Array2, Array4};
 use rcwm_gpu::Machine;
 use rcwm_models::episode::Episode;
 use rcwm_models::settings::{ModelKind, Preset};
-use rcwm_models::wire::{LinkSettings, ObservationFlags, SimulatorLink, Wait};
+use rcwm_models::wire::{ActionValues, Format, LinkSettings, ObservationFlags, SimulatorLink, Wait};
 use rcwm_trainer::acting::{Policy, PolicyInput, filter_step};
 use rcwm_trainer::checkpoint::Checkpoint;
 use rcwm_trainer::gpu::Share;
@@ -71,10 +71,10 @@ impl Simulator {
 }
 
 fn serve(instance: &str, episodes: u64, stop: &AtomicBool) -> Vec<Vec<[f32; 4]>> {
-    let link = SimulatorLink::open(LinkSettings::new(instance)).unwrap();
+    let link = SimulatorLink::open(LinkSettings::new(instance), &Format::metaworld()).unwrap();
     let (mut sequence, mut all) = (0, Vec::new());
     for episode in 0..episodes {
-        let (mut executed, mut done) = ([0.0; 4], Vec::new());
+        let (mut executed, mut done) = (ActionValues::zeros(4), Vec::new());
         for step in 0..=EPISODE_STEPS {
             let publish = || {
                 link.publish(|observation| {
@@ -82,8 +82,8 @@ fn serve(instance: &str, episodes: u64, stop: &AtomicBool) -> Vec<Vec<[f32; 4]>>
                     observation.episode = episode;
                     observation.step = step;
                     observation.reward = step as f32;
-                    observation.executed_action = executed;
-                    for (at, value) in observation.image.iter_mut().enumerate() {
+                    observation.executed().copy_from_slice(&executed);
+                    for (at, value) in observation.image(0).iter_mut().enumerate() {
                         *value = pixel(step as usize, at);
                     }
                     observation.flags = ObservationFlags::default()
@@ -108,7 +108,7 @@ fn serve(instance: &str, episodes: u64, stop: &AtomicBool) -> Vec<Vec<[f32; 4]>>
             sequence += 1;
             if step < EPISODE_STEPS {
                 executed = answer;
-                done.push(answer);
+                done.push(<[f32; 4]>::try_from(&*answer).unwrap());
             }
         }
         all.push(done);
@@ -294,8 +294,12 @@ fn a_policy_that_is_not_finite_sends_zeros_and_says_so() {
     let agent = Agent::new(&checkpoint.parameters.frozen(), &checkpoint.settings.model).unwrap();
     let mut policy = Policy::new(agent, 2, &Device::Cpu);
     let image = vec![90; 64 * 64 * 3];
-    let seen =
-        [0, 1].map(|simulator| PolicyInput { simulator, first: true, image: &image, executed: [0.0; 4] });
+    let seen = [0, 1].map(|simulator| PolicyInput {
+        simulator,
+        first: true,
+        image: &image,
+        executed: [0.0; 4].into(),
+    });
     let good = policy.decide(&seen, &mut Sampler::seeded(1)).unwrap();
     assert!(good.iter().all(|decision| !decision.refused && decision.action != [0.0; 4]));
     let poisoned = checkpoint.parameters.get("actor.out.bias").unwrap();

@@ -9,12 +9,11 @@ use super::graph::{self, GraphError};
 use super::manifest::{FORMAT, FileEntry, Limits, Manifest, PartEntry, PartName, TensorSpec};
 use super::version1::ManifestV1;
 use super::{DType, GOLDEN_BYTES_MAX, MANIFEST_BYTES_MAX, MANIFEST_FILE, PART_BYTES_MAX, PARTS_BYTES_MAX};
-use crate::interface::Action;
 use crate::files::{FileError, read_capped, sha256_hex};
+use crate::interface::Action;
 use crate::onnx::{self, OnnxError};
 use crate::settings::{ModelKind, SettingsError};
 use crate::tensors::{Tensors, TensorsError};
-
 
 /// Largest file of initial states accepted, in bytes.
 const INITIAL_BYTES_MAX: u64 = 1 << 20;

@@ -27,7 +27,8 @@ pub use crate::interface::ActionMode;
 pub use graph::GraphError;
 pub use load::{Bundle, BundleError, InitialState};
 pub use manifest::{
-    BundleKind, DType, FORMAT, Limits, FileEntry, Manifest, PartEntry, PartName, PolicyInputs, Provenance, TensorSpec,
+    BundleKind, DType, FORMAT, FileEntry, Limits, Manifest, PartEntry, PartName, PolicyInputs, Provenance,
+    TensorSpec,
 };
 
 /// File name of the manifest.

@@ -59,3 +59,24 @@ impl From<ManifestV1> for Manifest {
         }
     }
 }
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_bundle_of_version_1_is_read_as_one_of_metaworlds_arm() {
+        let text = include_str!("version1.toml");
+        let read = |text: &str| Manifest::from(toml::from_str::<ManifestV1>(text).unwrap());
+        let manifest = read(text);
+        manifest.check().unwrap();
+        assert_eq!((manifest.interface.clone(), manifest.format), (Interface::metaworld(), FORMAT));
+        assert!(manifest.policy.limits.is_none() && manifest.policy.inputs == ["image"]);
+        let narrow = read(&text.replace("action_low = [-1.0, -1.0", "action_low = [-0.5, -1.0"));
+        narrow.check().unwrap();
+        assert_eq!((narrow.limits().low[0], narrow.limits().high[0]), (-0.5, 1.0));
+        let positions = read(&text.replace("[provenance]", "action_mode = \"absolute\"\n\n[provenance]"));
+        positions.check().unwrap();
+        assert_eq!(positions.interface.action[0].mode, ActionMode::Absolute);
+    }
+}

@@ -3,7 +3,7 @@
 //! | key | type | shape | meaning |
 //! | --- | --- | --- | --- |
 //! | `image` | u8 | [T, 64, 64, 3] | upright, RGB |
-//! | `action` | f32 | [T, 4] | the action that LED TO `image[t]`; zeros at the first |
+//! | `action` | f32 | [T, n] | the action that LED TO `image[t]`, in [-1, 1] from limit to limit; zeros at the first |
 //! | `reward` | f32 | [T] | of that transition |
 //! | `is_first`, `is_last`, `is_terminal`, `success` | bool | [T] | |
 //! | `robot_mask` (optional) | u8 | [T, 64, 64, 1] | 1 where the robot is, else 0 |
@@ -266,7 +266,10 @@ impl EpisodeBuilder {
             return refuse("it is of another interface than those before it");
         }
         self.image.extend_from_slice(observation.image(0));
-        self.action.extend_from_slice(observation.executed());
+        let from = self.action.len();
+        self.action.resize(from + format.action_numbers(), 0.0);
+        // Finite: see above.
+        let _ = format.normaliser().from_units(observation.executed(), &mut self.action[from..]);
         self.reward.push(observation.reward);
         self.flags.push(flags);
         if let Some(mask) = observation.mask(0) {
@@ -300,9 +303,8 @@ impl EpisodeBuilder {
             image: Array4::from_shape_vec((steps, rows, columns, channels), this.image).expect(fits),
             action,
             reward: this.reward.into(),
-            robot_mask: (this.masks == steps).then(|| {
-                Array3::from_shape_vec((steps, rows, columns), this.robot_mask).expect(fits)
-            }),
+            robot_mask: (this.masks == steps)
+                .then(|| Array3::from_shape_vec((steps, rows, columns), this.robot_mask).expect(fits)),
             proprio: Some(
                 Array2::from_shape_vec((steps, format.interface().state_numbers()), this.proprio)
                     .expect(fits),

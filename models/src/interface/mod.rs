@@ -40,7 +40,11 @@ mod normalise;
 #[cfg(test)]
 mod tests;
 
+use std::path::{Path, PathBuf};
+
 use serde::{Deserialize, Serialize};
+
+use crate::files::{FileError, read_capped};
 
 pub use checks::{ACTION_NUMBERS_MAX, CAMERAS_MAX};
 pub use compare::{Mismatch, mismatches};
@@ -174,6 +178,18 @@ pub enum InterfaceError {
     Invalid { place: String, found: String, expected: String },
 }
 
+/// Why a robot's file could not be read.
+#[derive(Debug, thiserror::Error)]
+pub enum InterfaceFileError {
+    #[error(transparent)]
+    File(#[from] FileError),
+    #[error("{}: {source}", path.display())]
+    Interface { path: PathBuf, source: InterfaceError },
+}
+
+/// Largest file of a robot accepted, in bytes.
+const FILE_BYTES_MAX: u64 = 1 << 20;
+
 /// The file around an interface.
 #[derive(Debug, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
@@ -198,6 +214,18 @@ impl Interface {
         let File { interface, .. } = toml::from_str(text).map_err(syntax)?;
         interface.check()?;
         Ok(interface)
+    }
+
+    /// Reads the file of a robot.
+    ///
+    /// # Errors
+    /// [`InterfaceFileError`], which names the file.
+    pub fn read(path: &Path) -> Result<Self, InterfaceFileError> {
+        let bytes = read_capped(path, FILE_BYTES_MAX)?;
+        let wrong = |source| InterfaceFileError::Interface { path: path.to_path_buf(), source };
+        let text = String::from_utf8(bytes);
+        let text = text.map_err(|_| wrong(InterfaceError::Syntax("not a text (UTF-8)".into())))?;
+        Self::parse(&text).map_err(wrong)
     }
 
     /// The interface of Meta-World's arm, which messages of version 1 carry and bundles of version 1 need.

@@ -38,6 +38,12 @@ impl ActionValues {
         (numbers.len() <= ACTION_NUMBERS_MAX).then(|| Self::from_fn(numbers.len(), |at| numbers[at]))
     }
 
+    /// The bits of each, for comparisons that tell -0 from 0.
+    #[must_use]
+    pub fn to_bits(&self) -> Vec<u32> {
+        self.iter().map(|x| x.to_bits()).collect()
+    }
+
     #[must_use]
     pub fn is_finite(&self) -> bool {
         self.iter().all(|x| x.is_finite())
@@ -72,6 +78,28 @@ impl PartialEq for ActionValues {
 impl<const N: usize> PartialEq<[f32; N]> for ActionValues {
     fn eq(&self, other: &[f32; N]) -> bool {
         **self == *other
+    }
+}
+
+impl<const N: usize> PartialEq<ActionValues> for [f32; N] {
+    fn eq(&self, other: &ActionValues) -> bool {
+        *self == **other
+    }
+}
+
+impl IntoIterator for ActionValues {
+    type Item = f32;
+    type IntoIter = std::iter::Take<std::array::IntoIter<f32, ACTION_NUMBERS_MAX>>;
+    fn into_iter(self) -> Self::IntoIter {
+        self.values.into_iter().take(self.len)
+    }
+}
+
+impl<'a> IntoIterator for &'a ActionValues {
+    type Item = &'a f32;
+    type IntoIter = std::slice::Iter<'a, f32>;
+    fn into_iter(self) -> Self::IntoIter {
+        self.iter()
     }
 }
 

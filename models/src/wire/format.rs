@@ -3,7 +3,7 @@
 use std::sync::Arc;
 
 use super::ActionValues;
-use crate::interface::{Interface, Layout};
+use crate::interface::{Interface, Layout, Normaliser};
 
 /// By how much of its range a robot may report more than a limit allows as executed: it may have rounded.
 const EXECUTED_ROUNDING: f32 = 5e-4;
@@ -16,6 +16,7 @@ pub struct Format {
     hash: String,
     low: ActionValues,
     high: ActionValues,
+    normaliser: Normaliser,
 }
 
 impl Format {
@@ -25,7 +26,8 @@ impl Format {
             interface.action.iter().flat_map(of).map(|x| *x as f32).collect()
         };
         let (low, high) = (limits(|action| &action.low), limits(|action| &action.high));
-        Arc::new(Self { layout: Layout::of(&interface), hash: interface.hash(), low, high, interface })
+        let (layout, normaliser) = (Layout::of(&interface), Normaliser::of(&interface));
+        Arc::new(Self { layout, hash: interface.hash(), low, high, normaliser, interface })
     }
 
     /// That of Meta-World's arm.
@@ -60,6 +62,12 @@ impl Format {
     #[must_use]
     pub fn zeros(&self) -> ActionValues {
         ActionValues::zeros(self.action_numbers())
+    }
+
+    /// Actions in units, and in [-1, 1] as models and episodes have them.
+    #[must_use]
+    pub fn normaliser(&self) -> &Normaliser {
+        &self.normaliser
     }
 
     /// Whether a robot may execute this action: as many numbers as the interface has, each finite and within its limits.

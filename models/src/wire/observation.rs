@@ -49,6 +49,12 @@ impl std::fmt::Debug for Observation<'_> {
 }
 
 impl<'a> Observation<'a> {
+    /// All blocks, as they lie in shared memory.
+    #[must_use]
+    pub fn payload(&self) -> &'a [u8] {
+        self.payload
+    }
+
     #[must_use]
     pub fn format(&self) -> &'a Arc<Format> {
         self.format
@@ -226,7 +232,7 @@ impl OwnedObservation {
 /// An observation that is being written; its header's fields are its own.
 pub struct ObservationMut<'a> {
     pub(super) header: &'a mut ObservationHeader,
-    pub(super) format: &'a Format,
+    pub(super) format: &'a Arc<Format>,
     pub(super) payload: &'a mut [u8],
 }
 
@@ -263,6 +269,12 @@ impl ObservationMut<'_> {
     pub fn mask(&mut self, camera: usize) -> Option<&mut [u8]> {
         let block = self.format.layout().masks[camera].as_ref()?;
         Some(&mut self.payload[block.bytes.clone()])
+    }
+
+    /// What is written so far.
+    #[must_use]
+    pub fn view(&self) -> Observation<'_> {
+        Observation { header: self.header, format: self.format, payload: self.payload }
     }
 
     /// All of another of the same format, its header too.
@@ -309,7 +321,11 @@ mod tests {
         from.flags = super::super::ObservationFlags::MASK_VALID.0;
         assert!(from.view().mask(0).unwrap().iter().all(|pixel| *pixel == 255));
         to.copy_numbers(&from.view());
-        assert!(to.view().state() == from.view().state() && to.view().executed() == from.view().executed() && to.sequence == 3);
+        assert!(
+            to.view().state() == from.view().state()
+                && to.view().executed() == from.view().executed()
+                && to.sequence == 3
+        );
         assert!(to.view().image(0).iter().all(|byte| *byte == 0));
         to.copy(&from.view());
         assert_eq!(to, from);

@@ -11,7 +11,7 @@ use rcwm_lab::film::film;
 use rcwm_lab::log::{LoggedLatencies, ReplayError, ReplayReport, Replayer, write_episodes};
 use rcwm_lab::plot::{Curve, plot};
 use rcwm_models::bundle::Bundle;
-use rcwm_models::wire::{ActionSource, Observation, ObservationFlags};
+use rcwm_models::wire::{ActionSource, Format, ObservationFlags, OwnedObservation};
 
 use rcwm_runtime::EngineSettings;
 use rcwm_runtime::controller::Fallback;
@@ -48,32 +48,40 @@ fn state_of(policy: &Policy) -> (State, u128) {
 }
 
 fn tick(images: &mut ImagePacker, step: u32, state: Option<WholeState>) -> TickRecord {
-    let mut observation = Observation::zeroed();
+    let mut observation = OwnedObservation::zeroed(&Format::metaworld());
     (observation.step, observation.sequence) = (step, u64::from(step));
-    observation.flags = ObservationFlags::default().with(ObservationFlags::FIRST, step == 0).0;
-    observation.image[step as usize] = 200;
-    let image = images.pack(&observation.image, step == 0);
-    let mask = Some(PackedMask::pack(&observation.robot_mask));
-    let action = (step > 0).then_some([0.1; 4]);
-    let (outcome, stage_ns) = ([0.1; 4], vec![1; STAGES.len()]);
+    observation.flags = ObservationFlags::default()
+        .with(ObservationFlags::FIRST, step == 0)
+        .with(ObservationFlags::MASK_VALID, true)
+        .0;
+    observation.edit().image(0)[step as usize] = 200;
+    let observation = observation.view();
+    let image = images.pack(observation.image(0), step == 0);
+    let mask = observation.mask(0).map(PackedMask::pack);
+    let action = (step > 0).then_some([0.1; 4].into());
+    let (outcome, stage_ns) = ([0.1; 4].into(), vec![1; STAGES.len()]);
     let decided = LoggedOutcome::Decided { action: outcome, recomputed: false, surprise: None, stage_ns };
     TickRecord {
         dropped_before: 0,
         resumes: state.is_some(),
         is_first: step == 0,
-        observed: Some(Observed::of(&observation, image, mask)),
+        observed: Some(Observed::of(&observation, vec![image], vec![mask])),
         scheduled_ns: 10,
         received_ns: 20,
         overtaken: false,
         calls: vec![
             LoggedCall { kind: CallKind::Observe, action, outcome: decided },
-            LoggedCall { kind: CallKind::WorkAhead, action: Some([0.1; 4]), outcome: LoggedOutcome::Done(5) },
+            LoggedCall {
+                kind: CallKind::WorkAhead,
+                action: Some([0.1; 4].into()),
+                outcome: LoggedOutcome::Done(5),
+            },
         ],
         answer: Answer {
             answers: u64::from(step),
             published_ns: 30,
             source: ActionSource::Policy as u32,
-            action: [0.1; 4],
+            action: [0.1; 4].into(),
         },
         digest: [0; DIGEST_BYTES],
         state,
@@ -183,9 +191,9 @@ fn a_state_of_classes_that_do_not_exist_is_a_difference() {
 fn actions_that_are_no_numbers_do_not_reach_the_safety_filter() {
     for bad in [f32::NAN, f32::INFINITY, f32::NEG_INFINITY] {
         let report = of_records(|_, ticks| {
-            ticks[1].answer.action = [bad; 4];
-            ticks[2].calls[0].action = Some([bad; 4]);
-            ticks[3].calls[1].action = Some([bad; 4]);
+            ticks[1].answer.action = [bad; 4].into();
+            ticks[2].calls[0].action = Some([bad; 4].into());
+            ticks[3].calls[1].action = Some([bad; 4].into());
             ticks[3].calls[0].kind = CallKind::Imagine;
         });
         assert!(report.unwrap().ticks_differing > 0);

@@ -6,16 +6,15 @@ use std::path::Path;
 
 use rcwm_lab::film::{Filmed, film};
 use rcwm_lab::log::Replayer;
-use rcwm_models::ACTION_LEN;
 use rcwm_models::episode::Episode;
-use rcwm_models::wire::{Observation, ObservationFlags};
+use rcwm_models::wire::{ObservationFlags, OwnedObservation};
 use rcwm_runtime::log::{LogReader, LogSettings};
 use rcwm_runtime::policy::Sampling;
 use rcwm_runtime::{EngineSettings, Policy};
 use rcwm_testkit::{ask, image, observation, own_link, smallest_bundle, start_logging};
 
 /// What is filmed of a run on these observations.
-fn filmed(folder: &Path, observations: &[Observation]) -> Filmed {
+fn filmed(folder: &Path, observations: &[OwnedObservation]) -> Filmed {
     let (link, file) = (own_link(), folder.join("run.rcwmlog"));
     let peer = link.peer();
     let policy = Policy::load(&smallest_bundle(), EngineSettings::tract()).unwrap();
@@ -46,8 +45,8 @@ fn an_episode_is_recorded_as_it_was_published_and_filmed() {
     for step in 0..20_u32 {
         let expected = observation(0, step);
         assert!(episode.image.index_axis(ndarray::Axis(0), step as usize).iter().eq(image(step).iter()));
-        for index in 0..ACTION_LEN {
-            assert_eq!(episode.action[[step as usize, index]], expected.executed_action[index]);
+        for index in 0..4 {
+            assert_eq!(episode.action[[step as usize, index]], expected.view().executed_action()[index]);
         }
     }
     for ending in ["gif", "png"] {

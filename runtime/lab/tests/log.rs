@@ -10,7 +10,9 @@ use rcwm_lab::log::{Answers, ReplayReport, Replayer};
 use rcwm_models::bundle::{Bundle, PartName};
 use rcwm_models::episode::Episode;
 use rcwm_models::wire::clock::monotonic_ns;
-use rcwm_models::wire::{Action, ActionSource, Observation, ObservationFlags, SimulatorLink, Wait};
+use rcwm_models::wire::{
+    Action, ActionSource, ActionValues, ObservationFlags, OwnedObservation, SimulatorLink, Wait,
+};
 use rcwm_runtime::controller::{
     ControllerSettings, Counters, EpisodeResult, Episodes, Fallback, State, Tick, TickObserver, TickTimes,
 };
@@ -45,7 +47,7 @@ fn logged_run_of(
     let peer = link.peer();
     let settings = LogSettings::new("test", EngineSettings::tract(), sampling);
     let controller = start_logging(policy, &link, file, settings, records, |_| ());
-    let mut last = [0.0; 4];
+    let mut last = ActionValues::zeros(4);
     for sequence in 0..ticks {
         let step = (sequence % 10) as u32;
         let mut sent = observation(sequence, step);
@@ -53,7 +55,7 @@ fn logged_run_of(
         sent.flags |= if step == 9 { ObservationFlags::LAST.0 } else { 0 };
         sent.reward = if sequence % 23 == 17 { f32::NAN } else { 0.5 };
         if step > 0 && sequence % 3 != 0 {
-            sent.executed_action = last;
+            sent.edit().executed().copy_from_slice(&last);
         }
         last = ask(&peer, &sent).action;
     }
@@ -91,7 +93,7 @@ fn imagined_rate_limited_fallback_and_late_ticks_are_replayed() {
     let bundle = Bundle::open(&smallest_bundle()).unwrap();
     let sampling = Sampling::Sample { seed: 6 };
     let policy = Policy::new(&bundle, EngineSettings::tract(), sampling).unwrap();
-    let (fallback, rate_max) = (Fallback::Given([0.5, -0.5, 0.0, 3.0]), Some(0.03));
+    let (fallback, rate_max) = (Fallback::Given([0.5, -0.5, 0.0, 3.0].into()), Some(0.03));
     let settings =
         LogSettings { fallback, rate_max, ..LogSettings::new("test", EngineSettings::tract(), sampling) };
     let file = folder.path().join("run.rcwmlog");
@@ -109,7 +111,7 @@ fn imagined_rate_limited_fallback_and_late_ticks_are_replayed() {
     // Silence: some ticks are imagined.
     let imagined = wait_for(&peer, ActionSource::Imagined);
     // It comes after all.
-    peer.publish(|slot| *slot = real_time(imagined.answers, 1)).unwrap();
+    peer.publish_copy(&real_time(imagined.answers, 1)).unwrap();
     let fallback = wait_for(&peer, ActionSource::Fallback);
     let next = fallback.answers + 3;
     ask_now(&peer, || real_time(next, 2));
@@ -134,10 +136,10 @@ fn wait_for(peer: &SimulatorLink, source: ActionSource) -> Action {
 }
 
 /// Publishes an observation that is due now until it is answered: one that was due long ago is stale.
-fn ask_now(peer: &SimulatorLink, due_now: impl Fn() -> Observation) {
+fn ask_now(peer: &SimulatorLink, due_now: impl Fn() -> OwnedObservation) {
     for _ in 0..200 {
         let sent = due_now();
-        peer.publish(|slot| *slot = sent).unwrap();
+        peer.publish_copy(&sent).unwrap();
         let answer = peer.wait_action(Duration::from_millis(100)).unwrap();
         if matches!(answer, (Wait::Message(action), _) if action.answers == sent.sequence) {
             return;
@@ -152,7 +154,7 @@ fn a_log_that_begins_in_the_middle_of_a_run_is_replayed_from_there() {
     let sampling = Sampling::Sample { seed: 7 };
     let mut policy = Policy::new(&bundle, EngineSettings::tract(), sampling).unwrap();
     for step in 0..50 {
-        policy.observe(&rcwm_testkit::image(step), (step > 0).then_some(&[0.2; 4])).unwrap();
+        policy.observe(&rcwm_testkit::image(step), (step > 0).then_some(&[0.2; 4].into())).unwrap();
     }
     let folder = tempfile::tempdir().unwrap();
     let file = folder.path().join("run.rcwmlog");
@@ -219,7 +221,8 @@ fn what_was_logged_is_what_was_observed_and_sent() {
         let Entry::Tick(tick) = entry else { panic!("no policy took over") };
         let expected = observation(sequence, (sequence % 10) as u32);
         let found = tick.observation.unwrap();
-        assert_eq!((found.sequence, found.step, found.image), (sequence, expected.step, expected.image));
+        assert_eq!((found.sequence, found.step), (sequence, expected.step));
+        assert_eq!(found.view().image(0), expected.view().image(0));
         assert_eq!(found.reward.is_nan(), sequence % 23 == 17);
         assert_eq!(tick.record.answer.answers, sequence);
         assert!(tick.record.received_ns >= found.published_ns);
@@ -273,7 +276,7 @@ fn a_log_replays_with_its_own_bundle_only() {
     let folder = tempfile::tempdir().unwrap();
     let file = folder.path().join("run.rcwmlog");
     logged_run(&smallest_bundle(), &file, Sampling::Mode, 3);
-    let narrow = with_manifest(|manifest| manifest.control.action_low = [-0.5; 4]);
+    let narrow = with_manifest(|manifest| rcwm_testkit::limit(manifest, [-0.5; 4], [1.0; 4]));
     let mut command = Command::cargo_bin("rcwm-lab").unwrap();
     command.args(["replay", "--log"]).arg(&file).arg("--bundle").arg(narrow.path());
     let output = command.assert().code(1).get_output().clone();
@@ -325,11 +328,11 @@ fn a_controller_that_goes_back_to_an_earlier_state_is_replayed() {
     log.tick(&policy, 0);
     // Imagined twice, then the first of both frames comes after all.
     let before = policy.state().clone();
-    policy.work_ahead(Some(&[0.1; 4])).unwrap();
-    policy.imagine(&[0.1; 4]).unwrap();
-    policy.imagine(&[0.2; 4]).unwrap();
+    policy.work_ahead(Some(&[0.1; 4].into())).unwrap();
+    policy.imagine(&[0.1; 4].into()).unwrap();
+    policy.imagine(&[0.2; 4].into()).unwrap();
     policy.set_state(&before).unwrap();
-    policy.observe(&rcwm_testkit::image(1), Some(&[0.3; 4])).unwrap();
+    policy.observe(&rcwm_testkit::image(1), Some(&[0.3; 4].into())).unwrap();
     log.tick(&policy, 1);
     let report = log.replay();
     assert_eq!(report.first_difference, None);
@@ -357,15 +360,10 @@ impl CallLog {
             _ => None,
         });
         let source = ActionSource::Policy as u32;
-        let answer = Action {
-            answers: u64::from(step),
-            published_ns: 2,
-            source,
-            action: action.unwrap(),
-        };
+        let answer = Action { answers: u64::from(step), published_ns: 2, source, action: action.unwrap() };
         let (telemetry, counters) = (Telemetry::new(), Counters::default());
         self.recorder.ticked(&Tick {
-            observation: Some(&observation),
+            observation: Some(&observation.view()),
             is_first: step == 0,
             rewound: false,
             decision: None,

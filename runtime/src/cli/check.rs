@@ -2,16 +2,11 @@
 
 use std::path::{Path, PathBuf};
 
-use anyhow::Context;
 use clap::Args;
-use rcwm_models::files::read_capped;
 use rcwm_models::interface::{Interface, Layout, Mismatch};
 use serde::Serialize;
 
 use super::shared;
-
-/// Largest text of an interface that is read.
-const BYTES_MAX: u64 = 1 << 20;
 
 /// Arguments of `check`.
 #[derive(Debug, Args)]
@@ -22,8 +17,7 @@ const BYTES_MAX: u64 = 1 << 20;
 The file says what a robot offers: its states, cameras and actions with names, units and limits
 (docs/own-robot.md). Nothing is started and nothing moves.
 
-Exits 0 if the file is sound and the bundle fits in what it says: picture, rate, mode and limits of
-the action. Bundles have no names, kinds and units yet.")]
+Exits 0 if the file is sound and the bundle fits: names, kinds, units, order, limits, rate, cameras.")]
 pub(super) struct CheckArguments {
     /// The robot's interface, robot.toml
     robot: PathBuf,
@@ -49,7 +43,7 @@ struct Report<'a> {
 
 pub(super) fn run(arguments: &CheckArguments) -> anyhow::Result<()> {
     shared::prepare_json(arguments.json.as_deref())?;
-    let robot = read(&arguments.robot)?;
+    let robot = Interface::read(&arguments.robot)?;
     let bundle = arguments.bundle.as_deref().map(shared::open_bundle).transpose()?;
     let mismatches = bundle.as_ref().map(|bundle| bundle.manifest.mismatches(&robot));
     let layout = Layout::of(&robot);
@@ -80,14 +74,6 @@ pub(super) fn run(arguments: &CheckArguments) -> anyhow::Result<()> {
         folder.display(),
         found.len()
     )
-}
-
-fn read(path: &Path) -> anyhow::Result<Interface> {
-    let bytes = read_capped(path, BYTES_MAX)?;
-    let text = String::from_utf8(bytes).map_err(|_| {
-        anyhow::anyhow!("{}: not a text (UTF-8); expected TOML with [interface]", path.display())
-    })?;
-    Interface::parse(&text).with_context(|| path.display().to_string())
 }
 
 fn describe(robot: &Interface, report: &Report<'_>) {

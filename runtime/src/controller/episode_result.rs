@@ -1,7 +1,7 @@
 //! One episode, as the report tells it.
 
 use rcwm_models::tasks::task_name;
-use rcwm_models::wire::{ObservationHeader, ObservationFlags};
+use rcwm_models::wire::{ObservationFlags, ObservationHeader};
 use serde::Serialize;
 
 #[derive(Debug, Clone, Copy, PartialEq, Serialize)]

@@ -153,6 +153,8 @@ impl SafetyFilter {
 
 #[cfg(test)]
 mod tests {
+    use rcwm_models::wire::{Format, OwnedObservation};
+
     use super::*;
 
     const LOW: [f32; 4] = [-1.0, -1.0, 0.2, -1.0];
@@ -160,7 +162,12 @@ mod tests {
 
     fn limits(absolute: bool) -> ActionLimits {
         let rate_max = [f32::INFINITY; 4].into();
-        ActionLimits { low: LOW.into(), high: HIGH.into(), rate_max, absolute: if absolute { 0b1111 } else { 0 } }
+        ActionLimits {
+            low: LOW.into(),
+            high: HIGH.into(),
+            rate_max,
+            absolute: if absolute { 0b1111 } else { 0 },
+        }
     }
 
     fn safety_filter(rate_max: Option<f32>) -> SafetyFilter {
@@ -173,13 +180,13 @@ mod tests {
         passed
     }
 
-    fn executed(action: [f32; 4]) -> Observation {
-        let mut observation = Observation::zeroed(&Format::metaworld());
+    fn executed(action: [f32; 4]) -> OwnedObservation {
+        let mut observation = OwnedObservation::zeroed(&Format::metaworld());
         observation.edit().executed().copy_from_slice(&action);
         observation
     }
 
-    fn first(action: [f32; 4]) -> Observation {
+    fn first(action: [f32; 4]) -> OwnedObservation {
         let mut observation = executed(action);
         observation.flags = ObservationFlags::FIRST.0;
         observation
@@ -198,10 +205,10 @@ mod tests {
     fn what_is_not_finite_becomes_what_was_executed_last() {
         for absolute in [false, true] {
             let mut filter = SafetyFilter::new(limits(absolute), None);
-            filter.observed(&executed([0.4, -0.3, 0.5, 0.9]), true);
+            filter.observed(&executed([0.4, -0.3, 0.5, 0.9]).view(), true);
             for bad in [f32::NAN, f32::INFINITY, f32::NEG_INFINITY] {
                 let passed = filter.pass([0.5, bad, 0.5, 0.5].into()).unwrap();
-                assert_eq!((passed.action, passed.was_not_finite), ([0.4, -0.3, 0.5, 0.9], true));
+                assert_eq!((passed.action, passed.was_not_finite), ([0.4, -0.3, 0.5, 0.9].into(), true));
             }
             assert!(!filter.pass([9.0; 4].into()).unwrap().was_not_finite);
             send(&mut filter, [0.1, 0.2, 0.3, 0.4]);
@@ -215,7 +222,7 @@ mod tests {
         assert_eq!(filter.fallback(Fallback::Hold).unwrap(), [0.0; 4]);
         assert_eq!(filter.pass([f32::NAN; 4].into()).unwrap().action, [0.0, 0.0, 0.2, 0.0]);
         let mut filter = SafetyFilter::new(limits(true), Some(0.1));
-        filter.observed(&first([0.0; 4]), true);
+        filter.observed(&first([0.0; 4]).view(), true);
         let nothing = filter.pass([f32::NAN; 4].into()).is_none();
         assert!(
             nothing && filter.fallback(Fallback::Hold).is_none() && filter.fallback(Fallback::Zero).is_none()
@@ -228,12 +235,12 @@ mod tests {
     fn a_position_is_held_across_the_start_of_an_episode_and_a_motion_is_not() {
         for (absolute, held) in [(true, [0.7; 4]), (false, [0.0; 4])] {
             let mut filter = SafetyFilter::new(limits(absolute), None);
-            filter.observed(&executed([0.7; 4]), true);
-            filter.observed(&first([0.0; 4]), true);
+            filter.observed(&executed([0.7; 4]).view(), true);
+            filter.observed(&first([0.0; 4]).view(), true);
             assert_eq!(filter.held(), Some(held.into()), "absolute {absolute}");
             assert_eq!(filter.fallback(Fallback::Zero), Some(held.into()), "absolute {absolute}");
             // A robot that says where it stands is believed.
-            filter.observed(&first([0.3; 4]), true);
+            filter.observed(&first([0.3; 4]).view(), true);
             assert_eq!(filter.held(), Some([0.3; 4].into()), "absolute {absolute}");
         }
     }
@@ -243,10 +250,10 @@ mod tests {
         let mut filter = safety_filter(Some(0.1));
         filter.sent([0.4; 4].into());
         // Another episode or another publisher, whose first observation never came, with numbers that are none.
-        filter.observed(&executed([f32::NAN; 4]), true);
+        filter.observed(&executed([f32::NAN; 4]).view(), true);
         assert_eq!(filter.fallback(Fallback::Hold), Some([0.4; 4].into()));
         assert_near(filter.pass([-1.0; 4].into()), [0.3; 4]);
-        filter.observed(&first([0.0; 4]), true);
+        filter.observed(&first([0.0; 4]).view(), true);
         assert_eq!(filter.fallback(Fallback::Hold), Some([0.0; 4].into()));
     }
 
@@ -255,15 +262,15 @@ mod tests {
         let mut refused = executed([0.6; 4]);
         refused.reward = f32::NAN;
         let mut filter = safety_filter(None);
-        filter.observed(&refused, true);
+        filter.observed(&refused.view(), true);
         assert_eq!(filter.held(), Some([0.6; 4].into()));
         filter.sent([0.1; 4].into());
         for bad in [0.8, 3e38, f32::NAN] {
             refused.edit().executed().fill(bad);
-            filter.observed(&refused, false);
+            filter.observed(&refused.view(), false);
             assert_eq!(filter.held(), Some([0.1; 4].into()), "{bad}");
         }
-        filter.observed(&executed([3e38; 4]), false);
+        filter.observed(&executed([3e38; 4]).view(), false);
         assert_eq!(filter.held(), Some([0.1; 4].into()));
     }
 
@@ -292,20 +299,20 @@ mod tests {
     fn the_rate_limit_counts_from_what_was_executed_whoever_moved_the_robot() {
         let mut filter = safety_filter(Some(0.1));
         // Joined in the middle of an episode.
-        filter.observed(&executed([0.9, -0.9, 0.9, 0.9]), true);
+        filter.observed(&executed([0.9, -0.9, 0.9, 0.9]).view(), true);
         assert_near(filter.pass([-1.0; 4].into()), [0.8, -1.0, 0.8, 0.8]);
         send(&mut filter, [0.9, -0.9, 0.9, 0.9]);
         // What was sent was not executed.
-        filter.observed(&executed([0.0, 0.0, 0.5, 0.0]), false);
+        filter.observed(&executed([0.0, 0.0, 0.5, 0.0]).view(), false);
         assert_near(filter.pass([1.0; 4].into()), [0.1, 0.1, 0.6, 0.1]);
     }
 
     #[test]
     fn an_action_that_is_executed_one_observation_later_is_not_left_by_more_than_the_limit_either() {
         let mut filter = safety_filter(Some(0.1));
-        filter.observed(&first([0.0; 4]), true);
+        filter.observed(&first([0.0; 4]).view(), true);
         send(&mut filter, [1.0; 4]);
-        filter.observed(&executed([0.0; 4]), false);
+        filter.observed(&executed([0.0; 4]).view(), false);
         let back = filter.pass([-1.0; 4].into()).unwrap().action;
         assert!(back[0].abs() < 1e-6, "{back:?}, after 0.1 was sent");
     }
@@ -316,7 +323,7 @@ mod tests {
         send(&mut filter, [1.0; 4]);
         assert_eq!(filter.pass([1.0; 4].into()).unwrap().action, [1.0, 0.5, 1.0, 1.0]);
         assert_eq!(filter.held(), Some([0.5; 4].into()));
-        filter.observed(&first([0.0; 4]), true);
+        filter.observed(&first([0.0; 4]).view(), true);
         assert_eq!(filter.pass([1.0; 4].into()).unwrap().action, [0.5; 4]);
         assert!(!filter.pass([0.1, 0.1, 0.3, 0.1].into()).unwrap().rate_limited);
     }
@@ -339,7 +346,7 @@ mod tests {
         let mut limits = limits(false);
         limits.rate_max = [0.1, 0.5, f32::INFINITY, f32::INFINITY].into();
         let mut filter = SafetyFilter::new(limits, Some(0.3));
-        filter.observed(&executed([0.0, 0.0, 0.5, 0.0]), true);
+        filter.observed(&executed([0.0, 0.0, 0.5, 0.0]).view(), true);
         assert_near(filter.pass([1.0; 4].into()), [0.1, 0.3, 0.8, 0.3]);
     }
 
@@ -347,7 +354,7 @@ mod tests {
     fn where_a_hand_moves_and_a_gripper_is_placed_zero_holds_the_gripper() {
         let mut filter = SafetyFilter::new(ActionLimits { absolute: 0b1000, ..limits(false) }, None);
         assert!(filter.fallback(Fallback::Zero).is_none(), "no place of the gripper is known");
-        filter.observed(&executed([0.5, 0.4, 0.3, 0.7]), true);
+        filter.observed(&executed([0.5, 0.4, 0.3, 0.7]).view(), true);
         assert_eq!(filter.fallback(Fallback::Zero).unwrap(), [0.0, 0.0, 0.0, 0.7]);
     }
 }

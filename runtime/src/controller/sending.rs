@@ -1,6 +1,8 @@
 //! The way onto the wire: nothing that a newer observation has overtaken, nothing that has not passed the safety filter.
 
-use rcwm_models::wire::{Action, ActionSource, ActionValues, Observation, ObservationFlags, ObservationSample};
+use rcwm_models::wire::{
+    Action, ActionSource, ActionValues, Observation, ObservationFlags, ObservationSample,
+};
 
 use super::{Arrival, Controller, ControllerError};
 use crate::pacing::Stamps;
@@ -74,12 +76,8 @@ impl Controller {
         self.counters.non_finite_outputs += u64::from(passed.was_not_finite);
         self.counters.rate_limited += u64::from(passed.rate_limited);
         let source = if passed.was_not_finite { ActionSource::Fallback } else { source };
-        let mut answer = Action {
-            answers: sequence,
-            published_ns: 0,
-            source: source as u32,
-            action: passed.action,
-        };
+        let mut answer =
+            Action { answers: sequence, published_ns: 0, source: source as u32, action: passed.action };
         answer.published_ns = self.link.send(&answer)?;
         self.filter.sent(answer.action);
         self.answer = Some(answer);

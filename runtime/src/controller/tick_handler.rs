@@ -1,6 +1,8 @@
 //! One tick: with an observation, or without one.
 
-use rcwm_models::wire::{Action, ActionSource, ActionValues, Observation, ObservationFlags, ObservationSample};
+use rcwm_models::wire::{
+    Action, ActionSource, ActionValues, Observation, ObservationFlags, ObservationSample,
+};
 
 use super::{
     Arrival, Cause, Controller, ControllerError, EpisodeResult, Event, Response, State, Taken, Tick,

@@ -1,6 +1,6 @@
 //! The times of a tick, counted from when it was scheduled: one that is late or never answered cannot hide.
 
-use rcwm_models::wire::{ObservationHeader, ObservationFlags};
+use rcwm_models::wire::{ObservationFlags, ObservationHeader};
 
 use super::{Controller, Pace, TickTimes};
 use crate::pacing::Missing;
@@ -25,7 +25,12 @@ impl Controller {
         self.telemetry.record_policy(&decision.stage_ns);
     }
 
-    pub(super) fn record_times(&mut self, observation: &ObservationHeader, times: &TickTimes, unanswered: u64) {
+    pub(super) fn record_times(
+        &mut self,
+        observation: &ObservationHeader,
+        times: &TickTimes,
+        unanswered: u64,
+    ) {
         let TickTimes { scheduled_ns, published_ns, received_ns, .. } = *times;
         let period_ns = observation.period_ns;
         self.pace = Some(Pace::of(period_ns));

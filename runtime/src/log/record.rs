@@ -3,7 +3,9 @@
 use std::sync::Arc;
 
 use rcwm_models::bundle::{Limits, Manifest};
-use rcwm_models::wire::{Action, ActionValues, CAMERAS_MAX, Format, Observation, ObservationHeader, OwnedObservation};
+use rcwm_models::wire::{
+    Action, ActionValues, CAMERAS_MAX, Format, Observation, ObservationHeader, OwnedObservation,
+};
 use serde::{Deserialize, Serialize};
 use sha2::{Digest, Sha256};
 
@@ -207,7 +209,11 @@ pub struct Observed {
 impl Observed {
     /// Of an observation with its packed pictures and masks, one a camera.
     #[must_use]
-    pub fn of(observation: &Observation<'_>, images: Vec<PackedImage>, masks: Vec<Option<PackedMask>>) -> Self {
+    pub fn of(
+        observation: &Observation<'_>,
+        images: Vec<PackedImage>,
+        masks: Vec<Option<PackedMask>>,
+    ) -> Self {
         let o = observation;
         Self {
             sequence: o.sequence,
@@ -246,9 +252,10 @@ impl Observed {
             reward: self.reward,
         };
         let mut edited = observation.edit();
-        for (what, to, from) in
-            [("state", edited.state().len(), self.state.len()), ("executed action", edited.executed().len(), self.executed.len())]
-        {
+        for (what, to, from) in [
+            ("state", edited.state().len(), self.state.len()),
+            ("executed action", edited.executed().len(), self.executed.len()),
+        ] {
             if to != from {
                 return Err(format!("{what} of {from} numbers, the interface has {to}"));
             }

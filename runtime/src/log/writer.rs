@@ -168,7 +168,8 @@ impl LogWriter {
     fn observed(&mut self, observation: &Observation<'_>, keyframe: bool) -> Observed {
         let cameras = 0..observation.format().interface().camera.len();
         let images = self.images.iter_mut().enumerate();
-        let images = images.map(|(camera, packer)| packer.pack(observation.image(camera), keyframe)).collect();
+        let images =
+            images.map(|(camera, packer)| packer.pack(observation.image(camera), keyframe)).collect();
         let masks = cameras.map(|camera| observation.mask(camera).map(PackedMask::pack)).collect();
         Observed::of(observation, images, masks)
     }

@@ -18,7 +18,7 @@
 
 use std::time::Duration;
 
-use rcwm_models::wire::{ObservationHeader, ObservationFlags};
+use rcwm_models::wire::{ObservationFlags, ObservationHeader};
 
 /// Shortest period that is believed, in ns: one that a peer has garbled must not make the loop run wild.
 const PERIOD_NS_MIN: u64 = 50_000;

@@ -147,7 +147,7 @@ fn stale_is_what_was_scheduled_more_than_two_periods_before_it_came() {
 fn nothing_was_scheduled_or_published_later_than_it_was_received() {
     let (received_ns, late_ns) = (PUBLISHED_NS + 50_000, PUBLISHED_NS + 3 * PERIOD_NS);
     let seen = |scheduled_ns, published_ns| ObservationHeader { scheduled_ns, published_ns, ..observation() };
-    let stamps = |seen: Observation| {
+    let stamps = |seen: ObservationHeader| {
         let Stamps { scheduled_ns, published_ns, ahead_ns } = Stamps::of(&seen, received_ns);
         (scheduled_ns, published_ns, ahead_ns)
     };

@@ -123,7 +123,7 @@ mod tests {
         let mut noise = source(Sampling::Mode);
         noise.draw();
         assert!(noise.robot().iter().chain(noise.environment()).all(|x| *x == 0.0));
-        assert_eq!(noise.action(&[0.5; 4], &[1.0; 4]), [0.5; 4]);
+        assert_eq!(noise.action(&[0.5; 4].into(), &[1.0; 4].into()), [0.5; 4]);
     }
 
     #[test]
@@ -132,7 +132,10 @@ mod tests {
         a.draw();
         b.draw();
         assert_eq!(a.robot(), b.robot());
-        assert_eq!(a.action(&[0.0; 4], &[1.0; 4]), b.action(&[0.0; 4], &[1.0; 4]));
+        assert_eq!(
+            a.action(&[0.0; 4].into(), &[1.0; 4].into()),
+            b.action(&[0.0; 4].into(), &[1.0; 4].into())
+        );
         let mut rng = ChaCha8Rng::seed_from_u64(1);
         let count = 200_000;
         // A standard Gumbel has mean 0.5772 and variance pi^2 / 6.

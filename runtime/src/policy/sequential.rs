@@ -18,7 +18,10 @@ pub(super) struct Sequential {
 
 impl Sequential {
     pub(super) fn load(bundle: &Bundle, settings: EngineSettings) -> Result<Self, EngineError> {
-        Ok(Self { parts: Parts::load(bundle, settings)?, action: ActionValues::zeros(bundle.manifest.model.action) })
+        Ok(Self {
+            parts: Parts::load(bundle, settings)?,
+            action: ActionValues::zeros(bundle.manifest.model.action),
+        })
     }
 
     fn branches(&mut self, work: &mut Work<'_>) -> Result<(), PolicyError> {

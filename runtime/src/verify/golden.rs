@@ -3,8 +3,8 @@
 use std::path::PathBuf;
 
 use rcwm_models::bundle::{Bundle, DType, PartName, TensorSpec};
-use rcwm_models::wire::ActionValues;
 use rcwm_models::tensors::{Tensors, TensorsError, Values};
+use rcwm_models::wire::ActionValues;
 
 use super::VerifyError;
 use crate::policy::State;

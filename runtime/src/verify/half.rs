@@ -1,7 +1,7 @@
 //! What 16-bit weights change: the same ticks with both, from the same states and noise.
 
-use rcwm_models::wire::ActionValues;
 use rcwm_models::bundle::Bundle;
+use rcwm_models::wire::ActionValues;
 use serde::Serialize;
 
 use super::VerifyError;

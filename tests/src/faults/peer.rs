@@ -4,12 +4,13 @@ use std::collections::VecDeque;
 use std::sync::atomic::{AtomicBool, Ordering};
 use std::time::Duration;
 
+use rcwm_models::IMAGE_BYTES;
 use rcwm_models::bundle::Bundle;
 use rcwm_models::wire::clock::monotonic_ns;
 use rcwm_models::wire::{
-    Action, LinkError, LinkSettings, Observation, ObservationFlags, SimulatorLink, Wait,
+    Action, ActionValues, Format, LinkError, LinkSettings, ObservationFlags, OwnedObservation, SimulatorLink,
+    Wait,
 };
-use rcwm_models::{ACTION_LEN, IMAGE_BYTES};
 
 use crate::shipped_bundle;
 
@@ -66,11 +67,11 @@ pub fn serve(
     stop: &AtomicBool,
 ) -> Result<Served, LinkError> {
     let mut peer = Peer {
-        link: SimulatorLink::open(settings)?,
+        link: SimulatorLink::open(settings, &Format::metaworld())?,
         images: recorded_images(),
         period_ns: period.as_nanos() as u64,
         sequence: 0,
-        executed: [0.0; ACTION_LEN],
+        executed: ActionValues::zeros(4),
         held: false,
         delayed: VecDeque::new(),
         served: Served::default(),
@@ -104,7 +105,7 @@ struct Peer {
     sequence: u64,
     executed: ActionValues,
     held: bool,
-    delayed: VecDeque<(u64, Observation)>,
+    delayed: VecDeque<(u64, OwnedObservation)>,
     served: Served,
 }
 
@@ -173,21 +174,21 @@ impl Peer {
         Ok(())
     }
 
-    fn observation(&self, due_ns: u64) -> Observation {
-        let mut observation = Observation::zeroed();
+    fn observation(&self, due_ns: u64) -> OwnedObservation {
+        let mut observation = OwnedObservation::zeroed(self.link.format());
         (observation.sequence, observation.step) = (self.sequence, self.sequence as u32);
         (observation.scheduled_ns, observation.period_ns) = (due_ns, self.period_ns);
-        observation.executed_action = self.executed;
+        observation.edit().executed().copy_from_slice(&self.executed);
         observation.flags = ObservationFlags::default()
             .with(ObservationFlags::FIRST, self.sequence == 0)
             .with(ObservationFlags::ACTION_HELD, self.held)
             .0;
-        observation.image = self.images[self.sequence as usize % self.images.len()];
+        observation.edit().image(0).copy_from_slice(&self.images[self.sequence as usize % self.images.len()]);
         observation
     }
 
-    fn publish(&self, observation: &Observation) -> Result<(), LinkError> {
-        self.link.publish(|slot| *slot = *observation)
+    fn publish(&self, observation: &OwnedObservation) -> Result<(), LinkError> {
+        self.link.publish_copy(&observation)
     }
 }
 

@@ -4,6 +4,7 @@ use prost::Message;
 use rcwm_models::bundle::{Bundle, MANIFEST_FILE, Manifest, PartName};
 use rcwm_models::files::sha256_hex;
 use rcwm_models::onnx::{Model, Node, Tensor};
+use rcwm_models::wire::ActionValues;
 use rcwm_runtime::{EngineSettings, Policy};
 
 use crate::shipped_bundle;
@@ -67,7 +68,7 @@ fn median_of_mean() -> f32 {
         .iter()
         .enumerate()
         .map(|(index, image)| {
-            policy.observe(image, (index > 0).then_some(&[0.0; 4])).expect("it runs").mean[0]
+            policy.observe(image, (index > 0).then_some(&ActionValues::zeros(4))).expect("it runs").mean[0]
         })
         .collect();
     means.sort_by(f32::total_cmp);

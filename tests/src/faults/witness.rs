@@ -109,7 +109,7 @@ fn look(observations: &ObserverLink, actions: &ActionObserverLink, record: &Mute
     let mut record = record.lock().unwrap_or_else(PoisonError::into_inner);
     if let Wait::Message(observation) = observed {
         record.observations.push(Published {
-            publisher: observation.origin().value(),
+            publisher: observation.origin(),
             sequence: observation.sequence,
             scheduled_ns: observation.scheduled_ns,
             published_ns: observation.published_ns,

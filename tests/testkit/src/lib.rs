@@ -11,13 +11,14 @@ use std::time::Duration;
 
 use prost::Message;
 use rcwm_models::IMAGE_BYTES;
-use rcwm_models::bundle::{Bundle, MANIFEST_FILE, Manifest, PartName};
+use rcwm_models::bundle::{Bundle, Limits, MANIFEST_FILE, Manifest, PartName};
 use rcwm_models::files::sha256_hex;
+use rcwm_models::interface::{ActionMode, Fallback as InterfaceFallback, FallbackRule};
 use rcwm_models::onnx::{Graph, Model, Node, Tensor, data_type};
 use rcwm_models::tensors::Values;
 use rcwm_models::wire::clock::monotonic_ns;
 use rcwm_models::wire::{
-    Action, LinkSettings, Observation, ObservationFlags, SimulatorLink, Wait, forget_prefix,
+    Action, Format, LinkSettings, ObservationFlags, OwnedObservation, SimulatorLink, Wait, forget_prefix,
 };
 use rcwm_runtime::controller::{Controller, ControllerError, ControllerSettings, Ended, Fallback, RunReport};
 use rcwm_runtime::log::{LogSettings, LogSummary, LogWriter};
@@ -129,7 +130,7 @@ pub const PERIOD_NS: u64 = 200_000_000;
 pub const NEVER: Duration = Duration::from_secs(20);
 
 /// An observation of a fixed clock, due now.
-pub fn due_now(sequence: u64) -> Observation {
+pub fn due_now(sequence: u64) -> OwnedObservation {
     let mut observation = observation(sequence, sequence as u32);
     (observation.scheduled_ns, observation.period_ns) = (monotonic_ns(), PERIOD_NS);
     observation
@@ -149,7 +150,7 @@ pub fn own_link() -> OwnLink {
 impl OwnLink {
     /// Connects a peer that plays the simulator.
     pub fn peer(&self) -> SimulatorLink {
-        SimulatorLink::open(self.0.clone()).unwrap()
+        SimulatorLink::open(self.0.clone(), &Format::metaworld()).unwrap()
     }
 
     pub fn prefix(&self) -> &str {
@@ -253,13 +254,30 @@ pub fn with_golden(change: impl Fn(f32) -> f32) -> tempfile::TempDir {
     copy
 }
 
+/// Narrower limits for a policy's actions.
+pub fn limit(manifest: &mut Manifest, low: [f32; 4], high: [f32; 4]) {
+    manifest.policy.limits = Some(Limits { low: low.into(), high: high.into() });
+}
+
+/// What a policy's actions command.
+pub fn set_mode(manifest: &mut Manifest, mode: ActionMode) {
+    let action = &mut manifest.interface.action[0];
+    action.mode = mode;
+    action.fallback = InterfaceFallback::Rule(match mode {
+        ActionMode::Absolute => FallbackRule::Hold,
+        ActionMode::Delta | ActionMode::Velocity => FallbackRule::Zero,
+    });
+}
+
 /// An observation of an episode that begins at step 0, with an image of its own.
-pub fn observation(sequence: u64, step: u32) -> Observation {
-    let mut observation = Observation::zeroed();
+pub fn observation(sequence: u64, step: u32) -> OwnedObservation {
+    let mut observation = OwnedObservation::zeroed(&Format::metaworld());
     (observation.sequence, observation.step) = (sequence, step);
     observation.flags = ObservationFlags::default().with(ObservationFlags::FIRST, step == 0).0;
-    observation.executed_action = if step == 0 { [0.0; 4] } else { [0.3, -0.2, 0.1, 1.0] };
-    observation.image = image(step);
+    if step > 0 {
+        observation.edit().executed().copy_from_slice(&[0.3, -0.2, 0.1, 1.0]);
+    }
+    observation.edit().image(0).copy_from_slice(&image(step));
     observation
 }
 
@@ -271,14 +289,14 @@ pub fn image(step: u32) -> [u8; IMAGE_BYTES] {
 }
 
 /// Publishes an observation and waits for the action that answers it.
-pub fn ask(peer: &SimulatorLink, observation: &Observation) -> Action {
-    peer.publish(|slot| *slot = *observation).unwrap();
+pub fn ask(peer: &SimulatorLink, observation: &OwnedObservation) -> Action {
+    peer.publish_copy(&observation).unwrap();
     let start = std::time::Instant::now();
     while start.elapsed() < NEVER {
         match peer.wait_action(Duration::from_millis(100)).unwrap() {
             (Wait::Message(action), _) if action.answers == observation.sequence => return action,
             // The controller has just connected, or has lost the message to its start: ask again.
-            (Wait::TimedOut, events) if events.hello => peer.publish(|slot| *slot = *observation).unwrap(),
+            (Wait::TimedOut, events) if events.hello => peer.publish_copy(observation).unwrap(),
             _ => {}
         }
     }

@@ -10,11 +10,13 @@ use std::time::{Duration, Instant};
 use anyhow::Result;
 use rand::{Rng, SeedableRng};
 use rand_chacha::ChaCha8Rng;
-use rcwm_models::wire::{Action, ActionSource, ControllerLink, LinkSettings, ObservationFlags, Wait};
+use rcwm_models::wire::{
+    Action, ActionSource, ActionValues, ControllerLink, LinkSettings, ObservationFlags, Wait,
+};
 
 fn main() -> Result<()> {
     let instance = std::env::args().nth(1).unwrap_or_else(|| "rcwm".to_owned());
-    let link = ControllerLink::open(LinkSettings::new(&instance))?;
+    let link = ControllerLink::open(LinkSettings::new(&instance), |_| Vec::new())?;
     let mut random = ChaCha8Rng::seed_from_u64(0);
     let (mut answered, mut repeated, mut sequence_gaps) = (0_u64, 0_u64, 0_u64);
     let mut last = None;
@@ -32,11 +34,11 @@ fn main() -> Result<()> {
         }
         sequence_gaps += u64::from(!again && last.is_some_and(|last| observation.sequence != last + 1));
         last = Some(observation.sequence);
-        link.send(Action {
+        link.send(&Action {
             answers: observation.sequence,
             published_ns: 0,
             source: ActionSource::Policy as u32,
-            action: std::array::from_fn(|_| random.random_range(-1.0..=1.0)),
+            action: ActionValues::from_fn(4, |_| random.random_range(-1.0..=1.0)),
         })?;
         answered += 1;
     }

@@ -7,7 +7,7 @@ use pyo3::buffer::PyBuffer;
 use pyo3::call::PyCallArgs;
 use pyo3::prelude::*;
 use rcwm_models::tasks::task_id;
-use rcwm_models::wire::Observation;
+use rcwm_models::wire::ObservationMut;
 use rcwm_models::{ACTION_LEN, PROPRIOCEPTION_LEN};
 use serde::Serialize;
 
@@ -128,7 +128,7 @@ impl Environment {
     ///
     /// # Errors
     /// [`SimulatorError::Python`]; also after [`STEPS_MAX`] steps without a reset.
-    pub fn step(&self, action: ActionValues) -> Result<(), SimulatorError> {
+    pub fn step(&self, action: [f32; ACTION_LEN]) -> Result<(), SimulatorError> {
         let [x, y, z, grip] = action;
         self.call("executing an action", "step", (x, y, z, grip))
     }
@@ -137,7 +137,7 @@ impl Environment {
     ///
     /// # Errors
     /// [`SimulatorError::Python`].
-    pub fn expert_action(&self) -> Result<ActionValues, SimulatorError> {
+    pub fn expert_action(&self) -> Result<[f32; ACTION_LEN], SimulatorError> {
         self.call("asking the expert", "ask_expert", ())?;
         let mut action = [0.0; ACTION_LEN];
         Python::attach(|py| {
@@ -152,20 +152,22 @@ impl Environment {
     ///
     /// # Errors
     /// [`SimulatorError::Python`].
-    pub fn write_to(&self, observation: &mut Observation) -> Result<bool, SimulatorError> {
+    pub fn write_to(&self, observation: &mut ObservationMut<'_>) -> Result<bool, SimulatorError> {
         let mut facts = [0.0_f32; FACTS_LEN];
         Python::attach(|py| {
             self.facts.copy_to_slice(py, &mut facts)?;
-            if self.settings.masks {
-                self.mask.copy_to_slice(py, &mut observation.robot_mask)?;
+            if self.settings.masks
+                && let Some(mask) = observation.mask(0)
+            {
+                self.mask.copy_to_slice(py, mask)?;
             }
-            self.image.copy_to_slice(py, &mut observation.image)
+            self.image.copy_to_slice(py, observation.image(0))
         })
         .map_err(|error| Python::attach(|py| python_error(py, "reading the picture", &error)))?;
         let [reward, success, proprioception @ ..] = facts;
         observation.task = self.task_id;
         observation.reward = reward;
-        observation.proprioception = proprioception;
+        observation.state().copy_from_slice(&proprioception);
         Ok(success > 0.0)
     }
 

@@ -15,7 +15,7 @@ use rcwm_models::errors::one_line;
 use rcwm_models::files::{Output, prepare_output, write_output};
 use rcwm_models::progress::Bar;
 use rcwm_models::tasks::{DOWNSTREAM, TASKS, UPSTREAM, task_id};
-use rcwm_models::wire::{LinkSettings, SimulatorLink};
+use rcwm_models::wire::{Format, LinkSettings, SimulatorLink};
 use rcwm_simulator::environment::Environment;
 use rcwm_simulator::serve::{ServeSettings, serve};
 use rcwm_simulator::snapshot;
@@ -50,7 +50,7 @@ fn run_serve(arguments: &ServeArguments) -> Result<()> {
     let mut link = LinkSettings::new(&arguments.instance);
     link.spin = Duration::from_micros(arguments.spin_us);
     // Before Meta-World is loaded: a taken place is reported at once, and a controller may connect meanwhile.
-    let link = SimulatorLink::open(link)?;
+    let link = SimulatorLink::open(link, &Format::metaworld())?;
     let spinner = loading(&arguments.task);
     let environment = Environment::open(arguments.environment())?;
     spinner.finish_and_clear();

@@ -55,7 +55,7 @@ pub struct Script {
     noise_scale: f32,
     burst_steps_left: u32,
     /// Where it is pushed to, and for how many decisions more.
-    push: (ActionValues, u32),
+    push: ([f32; ACTION_LEN], u32),
     first: bool,
     pushed: bool,
 }
@@ -84,7 +84,7 @@ impl Script {
     ///
     /// # Errors
     /// [`SimulatorError::Python`] from the expert.
-    pub fn decide(&mut self, environment: &Environment) -> Result<Option<ActionValues>, SimulatorError> {
+    pub fn decide(&mut self, environment: &Environment) -> Result<Option<[f32; ACTION_LEN]>, SimulatorError> {
         Ok(match self.policy {
             Policy::Remote => None,
             Policy::Random => Some(self.uniform()),
@@ -101,7 +101,7 @@ impl Script {
     }
 
     /// The expert's decision, or a push in its place; the gripper does what the expert wants, so that nothing is dropped.
-    fn pushed_off(&mut self, expert: ActionValues) -> ActionValues {
+    fn pushed_off(&mut self, expert: [f32; ACTION_LEN]) -> [f32; ACTION_LEN] {
         let share = if std::mem::take(&mut self.first) { FIRST_PUSH_SHARE } else { PUSH_SHARE };
         if self.push.1 == 0 && self.random.random_bool(share) {
             self.push = (self.uniform(), self.random.random_range(PUSH_STEPS));
@@ -115,7 +115,7 @@ impl Script {
         [x, y, z, expert[GRIPPER]]
     }
 
-    fn mixed(&mut self, environment: &Environment) -> Result<ActionValues, SimulatorError> {
+    fn mixed(&mut self, environment: &Environment) -> Result<[f32; ACTION_LEN], SimulatorError> {
         if self.in_burst() {
             return Ok(self.uniform());
         }
@@ -132,7 +132,7 @@ impl Script {
         burst
     }
 
-    fn uniform(&mut self) -> ActionValues {
+    fn uniform(&mut self) -> [f32; ACTION_LEN] {
         std::array::from_fn(|_| self.random.random_range(-1.0..=1.0))
     }
 
@@ -147,7 +147,7 @@ impl Script {
 mod tests {
     use super::*;
 
-    fn uniform_actions(seed: u64, episode: u64) -> Vec<ActionValues> {
+    fn uniform_actions(seed: u64, episode: u64) -> Vec<[f32; ACTION_LEN]> {
         let mut script = Script::new(Policy::Random, seed, episode);
         (0..100).map(|_| script.uniform()).collect()
     }
@@ -183,7 +183,7 @@ mod tests {
         let (mut pushed, mut pushes, mut first) = (0, 0, 0);
         for episode in 0..200 {
             let mut script = Script::new(Policy::Pushed, 1, episode);
-            let mut before: Option<ActionValues> = None;
+            let mut before: Option<[f32; ACTION_LEN]> = None;
             for step in 0..100 {
                 let action = script.pushed_off(expert);
                 assert_eq!(action[GRIPPER], expert[GRIPPER]);

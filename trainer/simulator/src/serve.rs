@@ -9,7 +9,7 @@ use std::time::{Duration, Instant};
 
 use rcwm_models::ACTION_LEN;
 use rcwm_models::wire::clock::monotonic_ns;
-use rcwm_models::wire::{Action, Events, Observation, ObservationFlags, SimulatorLink, Wait};
+use rcwm_models::wire::{Action, Events, Observation, ObservationFlags, ObservationMut, SimulatorLink, Wait};
 
 use crate::environment::{Environment, STEPS_MAX};
 use crate::policy::Script;
@@ -33,7 +33,7 @@ struct Place {
     sequence: u64,
     episode: u64,
     step: u32,
-    executed: ActionValues,
+    executed: [f32; ACTION_LEN],
     held: bool,
     pushed: bool,
     scheduled_ns: u64,
@@ -49,10 +49,10 @@ struct Published {
 }
 
 /// An answer to the present observation, fit to be executed; `None` when there was none.
-type Answer = Option<ActionValues>;
+type Answer = Option<[f32; ACTION_LEN]>;
 
 /// The hand stays where it is, for actions are displacements; the gripper goes on with what it does.
-fn at_rest([_, _, _, grip]: ActionValues) -> ActionValues {
+fn at_rest([_, _, _, grip]: [f32; ACTION_LEN]) -> [f32; ACTION_LEN] {
     [0.0, 0.0, 0.0, grip]
 }
 
@@ -210,27 +210,29 @@ impl Server<'_> {
     /// Publishes the present observation.
     fn publish(&self, repeated: bool) -> Result<Published, SimulatorError> {
         let mut slot = self.link.slot()?;
-        let solved = self.environment.write_to(&mut slot)?;
-        self.fill(&mut slot, solved, repeated);
-        if !slot.is_finite() {
+        let mut observation = slot.edit();
+        let solved = self.environment.write_to(&mut observation)?;
+        self.fill(&mut observation, solved, repeated);
+        let observation = observation.view();
+        if !observation.is_finite() {
             return Err(SimulatorError::Diverged {
                 task: self.environment.settings().task.clone(),
                 episode: self.place.episode,
                 step: self.place.step,
             });
         }
-        self.snapshot(&slot)?;
-        let published = Published { reward: slot.reward, solved, published_ns: monotonic_ns() };
+        self.snapshot(&observation)?;
+        let published = Published { reward: observation.reward, solved, published_ns: monotonic_ns() };
         self.link.send(slot)?;
         Ok(published)
     }
 
-    fn fill(&self, observation: &mut Observation, solved: bool, repeated: bool) {
+    fn fill(&self, observation: &mut ObservationMut<'_>, solved: bool, repeated: bool) {
         let Place { sequence, episode, step, executed, held, pushed, scheduled_ns, .. } = self.place;
         observation.sequence = sequence;
         observation.episode = episode;
         observation.step = step;
-        observation.executed_action = executed;
+        observation.executed().copy_from_slice(&executed);
         observation.scheduled_ns = match self.settings.pace {
             Pace::RealTime { .. } if !repeated => scheduled_ns,
             _ => monotonic_ns(),
@@ -250,7 +252,7 @@ impl Server<'_> {
             .0;
     }
 
-    fn snapshot(&self, observation: &Observation) -> Result<(), SimulatorError> {
+    fn snapshot(&self, observation: &Observation<'_>) -> Result<(), SimulatorError> {
         let Some(folder) = &self.settings.snapshots else { return Ok(()) };
         let first = observation.episode == self.settings.first_episode;
         if first && observation.step.is_multiple_of(SNAPSHOT_STEPS) {
@@ -366,8 +368,9 @@ impl Server<'_> {
 
     /// An action with a value that is not finite is no answer.
     fn checked(&mut self, action: &Action) -> Answer {
-        let finite = action.action.iter().all(|x| x.is_finite());
-        self.tally.refused += u64::from(!finite);
-        finite.then_some(action.action)
+        let numbers = <[f32; ACTION_LEN]>::try_from(&*action.action).ok();
+        let fit = numbers.filter(|numbers| numbers.iter().all(|x| x.is_finite()));
+        self.tally.refused += u64::from(fit.is_none());
+        fit
     }
 }

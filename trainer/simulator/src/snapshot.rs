@@ -6,7 +6,7 @@ use std::path::{Path, PathBuf};
 use rcwm_models::IMAGE_SIDE;
 use rcwm_models::files::FileError;
 use rcwm_models::picture::write_png;
-use rcwm_models::wire::{Observation, ObservationFlags};
+use rcwm_models::wire::Observation;
 
 use crate::SimulatorError;
 
@@ -35,7 +35,7 @@ pub fn prepare(folder: &Path, task: &str) -> Result<(), SimulatorError> {
 ///
 /// # Errors
 /// [`SimulatorError::Picture`].
-pub fn write(folder: &Path, task: &str, observation: &Observation) -> Result<PathBuf, SimulatorError> {
+pub fn write(folder: &Path, task: &str, observation: &Observation<'_>) -> Result<PathBuf, SimulatorError> {
     let path = folder.join(format!("{task}-e{:04}-s{:03}.png", observation.episode, observation.step));
     let [width, height] = [width(observation), IMAGE_SIDE].map(|side| side * ZOOM);
     let pixels = (0..height).flat_map(|y| (0..width).map(move |x| (x / ZOOM, y / ZOOM)));
@@ -45,23 +45,26 @@ pub fn write(folder: &Path, task: &str, observation: &Observation) -> Result<Pat
 }
 
 /// Width of the picture, with the mask beside it where there is one.
-fn width(observation: &Observation) -> usize {
-    if observation.is(ObservationFlags::MASK_VALID) { 2 * IMAGE_SIDE + GAP } else { IMAGE_SIDE }
+fn width(observation: &Observation<'_>) -> usize {
+    if observation.mask(0).is_some() { 2 * IMAGE_SIDE + GAP } else { IMAGE_SIDE }
 }
 
-fn pixel(observation: &Observation, x: usize, y: usize) -> [u8; 3] {
+fn pixel(observation: &Observation<'_>, x: usize, y: usize) -> [u8; 3] {
     if x < IMAGE_SIDE {
         let at = 3 * (y * IMAGE_SIDE + x);
-        [observation.image[at], observation.image[at + 1], observation.image[at + 2]]
+        let image = observation.image(0);
+        [image[at], image[at + 1], image[at + 2]]
     } else if x < IMAGE_SIDE + GAP {
         [0; 3]
     } else {
-        [observation.robot_mask[y * IMAGE_SIDE + x - IMAGE_SIDE - GAP]; 3]
+        [observation.mask(0).map_or(0, |mask| mask[y * IMAGE_SIDE + x - IMAGE_SIDE - GAP]); 3]
     }
 }
 
 #[cfg(test)]
 mod tests {
+    use rcwm_models::wire::{Format, ObservationFlags, OwnedObservation};
+
     use super::*;
 
     #[test]
@@ -69,7 +72,8 @@ mod tests {
         let folder = tempfile::tempdir().unwrap();
         let pictures = folder.path().join("pictures");
         prepare(&pictures, "reach").unwrap();
-        let first = write(&pictures, "reach", &Observation::zeroed()).unwrap();
+        let first =
+            write(&pictures, "reach", &OwnedObservation::zeroed(&Format::metaworld()).view()).unwrap();
         prepare(&pictures, "reach-wall").unwrap();
         let error = prepare(&pictures, "reach").unwrap_err().to_string();
         assert!(error.contains(&first.display().to_string()), "{error}");
@@ -77,13 +81,13 @@ mod tests {
 
     #[test]
     fn picture_and_mask_lie_beside_each_other_the_first_row_on_top() {
-        let mut observation = Observation::zeroed();
-        observation.image[..3].copy_from_slice(&[1, 2, 3]);
-        assert_eq!(width(&observation), 64);
+        let mut observation = OwnedObservation::zeroed(&Format::metaworld());
+        observation.edit().image(0)[..3].copy_from_slice(&[1, 2, 3]);
+        assert_eq!(width(&observation.view()), 64);
         observation.flags = ObservationFlags::MASK_VALID.0;
-        observation.robot_mask[63 * 64] = 255;
+        observation.edit().mask(0).unwrap()[63 * 64] = 255;
         let folder = tempfile::tempdir().unwrap();
-        let path = write(folder.path(), "reach", &observation).unwrap();
+        let path = write(folder.path(), "reach", &observation.view()).unwrap();
         let picture = image::open(path).unwrap().into_rgb8();
         assert_eq!(picture.dimensions(), (6 * 130, 6 * 64));
         for (x, y, found) in

@@ -2,7 +2,7 @@
 #![allow(clippy::unwrap_used, reason = "a test may panic")]
 
 use rcwm_models::tasks::TASKS;
-use rcwm_models::wire::Observation;
+use rcwm_models::wire::{Format, ObservationFlags, OwnedObservation};
 use rcwm_models::{ACTION_LEN, IMAGE_SIDE};
 use rcwm_simulator::SimulatorError;
 use rcwm_simulator::environment::{
@@ -22,15 +22,19 @@ fn settings(task: &str) -> EnvironmentSettings {
     }
 }
 
-fn see(environment: &Environment) -> (Observation, bool) {
-    let mut observation = Observation::zeroed();
-    let solved = environment.write_to(&mut observation).unwrap();
-    assert!(observation.is_finite());
-    (observation, solved)
+mod seen;
+use seen::Seen;
+
+fn see(environment: &Environment) -> (Seen, bool) {
+    let mut observation = OwnedObservation::zeroed(&Format::metaworld());
+    let solved = environment.write_to(&mut observation.edit()).unwrap();
+    assert!(observation.view().is_finite());
+    observation.flags = ObservationFlags::MASK_VALID.0;
+    (observation.view().into(), solved)
 }
 
 /// The first observation of an episode, and those after each of some seeded random actions.
-fn watch(environment: &Environment, episode: u64, steps: u32) -> Vec<Observation> {
+fn watch(environment: &Environment, episode: u64, steps: u32) -> Vec<Seen> {
     environment.reset(episode).unwrap();
     let mut script = Script::new(Policy::Random, 9, episode);
     let mut seen = vec![see(environment).0];
@@ -41,12 +45,12 @@ fn watch(environment: &Environment, episode: u64, steps: u32) -> Vec<Observation
     seen
 }
 
-fn numbers(observation: &Observation) -> (u32, [u32; 18]) {
+fn numbers(observation: &Seen) -> (u32, [u32; 18]) {
     (observation.reward.to_bits(), observation.proprioception.map(f32::to_bits))
 }
 
 #[track_caller]
-fn assert_same(a: &[Observation], b: &[Observation]) {
+fn assert_same(a: &[Seen], b: &[Seen]) {
     assert_eq!(a.len(), b.len());
     for (step, (a, b)) in a.iter().zip(b).enumerate() {
         assert_eq!(numbers(a), numbers(b), "reward or proprioception differ at step {step}");
@@ -83,7 +87,7 @@ fn the_first_picture_shows_the_goal_where_it_stays() {
         reach.step([0.0; ACTION_LEN]).unwrap();
         let after = see(&reach).0;
         let robot = |pixel: usize| before.robot_mask[pixel] > 0 || after.robot_mask[pixel] > 0;
-        let picture = |seen: &Observation, pixel: usize| -> [u8; 3] {
+        let picture = |seen: &Seen, pixel: usize| -> [u8; 3] {
             seen.image[3 * pixel..3 * (pixel + 1)].try_into().unwrap()
         };
         let changed = (0..IMAGE_SIDE * IMAGE_SIDE)
@@ -114,7 +118,7 @@ fn the_fast_picture_has_the_physics_of_the_faithful_one_and_nearly_its_mask() {
     for (a, b) in fast.iter().zip(&faithful) {
         assert_eq!(numbers(a), numbers(b));
     }
-    let (fast, faithful) = (fast[30], faithful[30]);
+    let (fast, faithful) = (&fast[30], &faithful[30]);
     let pairs = || fast.robot_mask.iter().zip(&faithful.robot_mask);
     let both = share(pairs().map(|(a, b)| a & b == 255));
     let any = share(pairs().map(|(a, b)| a | b == 255));
@@ -214,7 +218,7 @@ fn disturbed(disturb: Disturbance) -> Environment {
 }
 
 /// Shares of the robot's pixels and of the others that are the same in both.
-fn unchanged(a: &Observation, b: &Observation) -> (f64, f64) {
+fn unchanged(a: &Seen, b: &Seen) -> (f64, f64) {
     let pixels = || a.image.chunks(3).zip(b.image.chunks(3)).zip(&a.robot_mask);
     let of = |value: u8| share(pixels().filter(|(_, mask)| **mask == value).map(|((a, b), _)| a == b));
     (of(255), of(0))
@@ -245,8 +249,8 @@ fn the_papers_look_is_always_the_same_and_leaves_the_sky() {
     let environment = disturbed(Disturbance::Paper);
     let plain = disturbed(Disturbance::None);
     for episode in 0..2 {
-        let (a, b) = (watch(&plain, episode, 1)[0], watch(&environment, episode, 1)[0]);
-        let pixel = |seen: &Observation, x: usize, y: usize| -> [u8; 3] {
+        let (a, b) = (watch(&plain, episode, 1).remove(0), watch(&environment, episode, 1).remove(0));
+        let pixel = |seen: &Seen, x: usize, y: usize| -> [u8; 3] {
             seen.image[3 * (y * IMAGE_SIDE + x)..][..3].try_into().unwrap()
         };
         assert_eq!(pixel(&a, 2, 2), pixel(&b, 2, 2), "the sky");

@@ -7,7 +7,7 @@ use std::time::{Duration, Instant};
 
 use rcwm_models::ACTION_LEN;
 use rcwm_models::wire::{
-    Action, ActionSource, ControllerLink, LinkSettings, Observation, ObservationFlags, ObserverLink,
+    Action, ActionSource, ControllerLink, Format, LinkSettings, ObservationFlags, ObserverLink,
     SimulatorLink, Wait,
 };
 use rcwm_simulator::environment::{Disturbance, Environment, EnvironmentSettings, Layouts};
@@ -42,7 +42,7 @@ fn run<T: Send + 'static>(
     stop: &AtomicBool,
     controller: impl FnOnce(LinkSettings) -> T + Send + 'static,
 ) -> (Tally, T) {
-    let link = SimulatorLink::open(link_settings(&settings.instance)).unwrap();
+    let link = SimulatorLink::open(link_settings(&settings.instance), &Format::metaworld()).unwrap();
     let environment = Environment::open(EnvironmentSettings {
         task: "reach".to_owned(),
         layouts: Layouts::Learning,
@@ -58,15 +58,18 @@ fn run<T: Send + 'static>(
     (tally, controller.join().unwrap())
 }
 
-fn action(answers: u64, action: ActionValues) -> Action {
-    Action { answers, published_ns: 0, source: ActionSource::Policy as u32, action }
+mod seen;
+use seen::Seen;
+
+fn action(answers: u64, action: [f32; ACTION_LEN]) -> Action {
+    Action { answers, published_ns: 0, source: ActionSource::Policy as u32, action: action.into() }
 }
 
-fn next(link: &ControllerLink) -> Option<Box<Observation>> {
+fn next(link: &ControllerLink) -> Option<Box<Seen>> {
     let start = Instant::now();
     while start.elapsed() < TIMEOUT {
         match link.wait_observation(Duration::from_millis(100)).unwrap() {
-            Wait::Message(observation) => return Some(Box::new(*observation)),
+            Wait::Message(observation) => return Some(Box::new(observation.view().into())),
             Wait::TimedOut => {}
             Wait::Closed => return None,
         }
@@ -76,26 +79,26 @@ fn next(link: &ControllerLink) -> Option<Box<Observation>> {
 
 /// Connects, and waits for the observation that the simulator repeats for a controller that said hello: after it, nothing is
 /// repeated but for a silence.
-fn meet(settings: LinkSettings) -> (ControllerLink, Box<Observation>) {
-    let link = ControllerLink::open(settings).unwrap();
+fn meet(settings: LinkSettings) -> (ControllerLink, Box<Seen>) {
+    let link = ControllerLink::open(settings, |_| Vec::new()).unwrap();
     let first =
         std::iter::repeat_with(|| next(&link).unwrap()).find(|o| o.is(ObservationFlags::REPEATED)).unwrap();
     (link, first)
 }
 
 /// Answers everything with `decide` until the simulator closes; returns what it saw for the first time.
-fn answer_all(link: &ControllerLink, decide: impl Fn(&Observation) -> ActionValues) -> Vec<Observation> {
-    let mut seen: Vec<Observation> = Vec::new();
+fn answer_all(link: &ControllerLink, decide: impl Fn(&Seen) -> [f32; ACTION_LEN]) -> Vec<Seen> {
+    let mut seen: Vec<Seen> = Vec::new();
     while let Some(observation) = next(link) {
         if seen.last().is_none_or(|last| last.sequence != observation.sequence) {
-            seen.push(*observation);
+            seen.push(Seen::clone(&observation));
         }
-        link.send(action(observation.sequence, decide(&observation))).unwrap();
+        link.send(&action(observation.sequence, decide(&observation))).unwrap();
     }
     seen
 }
 
-fn decision(observation: &Observation) -> ActionValues {
+fn decision(observation: &Seen) -> [f32; ACTION_LEN] {
     [observation.sequence as f32 / 20.0, -0.5, 3.0, 0.25]
 }
 
@@ -103,7 +106,7 @@ fn decision(observation: &Observation) -> ActionValues {
 fn in_lock_step_each_observation_comes_once_with_the_clipped_action_that_answered_the_one_before() {
     let settings = serve_settings("exact");
     let (tally, seen) = run(&settings, &AtomicBool::new(false), |link| {
-        answer_all(&ControllerLink::open(link).unwrap(), decision)
+        answer_all(&ControllerLink::open(link, |_| Vec::new()).unwrap(), decision)
     });
     let places: Vec<_> = seen.iter().map(|o| (o.sequence, o.episode, o.step)).collect();
     let expected: Vec<_> = (0..2).flat_map(|e| (0..6).map(move |s| (6 * e + u64::from(s), e, s))).collect();
@@ -126,10 +129,12 @@ fn in_lock_step_each_observation_comes_once_with_the_clipped_action_that_answere
 fn an_action_that_is_not_finite_is_refused_and_the_last_one_is_held() {
     let settings = ServeSettings { episodes: Some(1), ..serve_settings("finite") };
     let (tally, seen) = run(&settings, &AtomicBool::new(false), |link| {
-        answer_all(&ControllerLink::open(link).unwrap(), |observation| match observation.step {
-            0 | 2 => [f32::NAN, 0.0, 0.0, 0.0],
-            4 => [0.0, 0.0, f32::INFINITY, 0.0],
-            _ => [0.5; ACTION_LEN],
+        answer_all(&ControllerLink::open(link, |_| Vec::new()).unwrap(), |observation| {
+            match observation.step {
+                0 | 2 => [f32::NAN, 0.0, 0.0, 0.0],
+                4 => [0.0, 0.0, f32::INFINITY, 0.0],
+                _ => [0.5; ACTION_LEN],
+            }
         })
     });
     let executed: Vec<_> =
@@ -144,13 +149,13 @@ fn a_controller_that_vanishes_is_followed_by_the_next_one_without_a_lost_step() 
     let (tally, (seen, continued)) = run(&settings, &AtomicBool::new(false), |settings| {
         let (first, mut observation) = meet(settings.clone());
         for _ in 0..3 {
-            first.send(action(observation.sequence, decision(&observation))).unwrap();
+            first.send(&action(observation.sequence, decision(&observation))).unwrap();
             observation = next(&first).unwrap();
         }
         let unanswered = observation;
         // Gone without goodbye.
         drop(first);
-        let seen = answer_all(&ControllerLink::open(settings).unwrap(), decision);
+        let seen = answer_all(&ControllerLink::open(settings, |_| Vec::new()).unwrap(), decision);
         let continued = seen[0].sequence == unanswered.sequence && seen[0].image == unanswered.image;
         (seen, continued)
     });
@@ -165,14 +170,14 @@ fn an_answer_to_another_observation_is_dropped_and_counted() {
     let settings = ServeSettings { episodes: Some(1), ..serve_settings("stale") };
     let (tally, ()) = run(&settings, &AtomicBool::new(false), |settings| {
         let (link, first) = meet(settings);
-        link.send(action(first.sequence, [0.0; ACTION_LEN])).unwrap();
+        link.send(&action(first.sequence, [0.0; ACTION_LEN])).unwrap();
         let mut misled = false;
         while let Some(observation) = next(&link) {
             let mislead = observation.step == 2 && !misled;
             misled |= mislead;
             // The observation comes again after a silence, and is answered then.
             let answers = observation.sequence + if mislead { 7 } else { 0 };
-            link.send(action(answers, [0.0; ACTION_LEN])).unwrap();
+            link.send(&action(answers, [0.0; ACTION_LEN])).unwrap();
         }
     });
     assert_eq!((tally.dropped, tally.steps), (1, 5));
@@ -188,13 +193,13 @@ fn in_real_time_a_silent_controller_has_its_last_action_held() {
         ..serve_settings("held")
     };
     let (tally, seen) = run(&settings, &AtomicBool::new(false), |settings| {
-        let link = ControllerLink::open(settings).unwrap();
+        let link = ControllerLink::open(settings, |_| Vec::new()).unwrap();
         let mut seen = Vec::new();
         while let Some(observation) = next(&link) {
             if observation.step < 3 {
-                link.send(action(observation.sequence, [0.5; ACTION_LEN])).unwrap();
+                link.send(&action(observation.sequence, [0.5; ACTION_LEN])).unwrap();
             }
-            seen.push(*observation);
+            seen.push(Seen::clone(&observation));
         }
         seen
     });
@@ -211,23 +216,23 @@ fn moved_until_left(
     period_ns: u64,
     steps_max: u32,
     leave: impl FnOnce(ControllerLink) -> Option<ControllerLink> + Send + 'static,
-) -> (Tally, Vec<Observation>) {
+) -> (Tally, Vec<Seen>) {
     let pace = Pace::RealTime { period_ns };
     let settings = ServeSettings { episodes: Some(1), steps_max, pace, ..serve_settings(instance) };
     run(&settings, &AtomicBool::new(false), move |settings| {
         let watcher = ObserverLink::open(settings.clone()).unwrap();
-        let link = ControllerLink::open(settings).unwrap();
+        let link = ControllerLink::open(settings, |_| Vec::new()).unwrap();
         let mut observation = next(&link).unwrap();
         while observation.step < 2 {
-            link.send(action(observation.sequence, [0.5, -0.5, 0.25, 0.75])).unwrap();
+            link.send(&action(observation.sequence, [0.5, -0.5, 0.25, 0.75])).unwrap();
             observation = next(&link).unwrap();
         }
-        link.send(action(observation.sequence, [0.5, -0.5, 0.25, 0.75])).unwrap();
+        link.send(&action(observation.sequence, [0.5, -0.5, 0.25, 0.75])).unwrap();
         let left = leave(link);
         let (start, mut seen) = (Instant::now(), Vec::new());
         while start.elapsed() < TIMEOUT {
             match watcher.wait_observation(Duration::from_millis(100)).unwrap() {
-                Wait::Message(observation) => seen.push(*observation),
+                Wait::Message(observation) => seen.push(observation.view().into()),
                 Wait::TimedOut => {}
                 Wait::Closed => break,
             }
@@ -237,7 +242,7 @@ fn moved_until_left(
     })
 }
 
-const AT_REST: ActionValues = [0.0, 0.0, 0.0, 0.75];
+const AT_REST: [f32; ACTION_LEN] = [0.0, 0.0, 0.0, 0.75];
 
 #[test]
 fn in_real_time_the_robot_rests_once_its_controller_has_said_that_it_leaves() {
@@ -268,7 +273,7 @@ fn in_real_time_the_robot_rests_when_its_controller_has_been_silent_for_a_second
 fn a_scripted_policy_in_lock_step_waits_for_a_receipt_and_ignores_its_content() {
     let settings = ServeSettings { policy: Policy::Random, ..serve_settings("receipt") };
     let (_, seen) = run(&settings, &AtomicBool::new(false), |link| {
-        answer_all(&ControllerLink::open(link).unwrap(), |_| [0.125; ACTION_LEN])
+        answer_all(&ControllerLink::open(link, |_| Vec::new()).unwrap(), |_| [0.125; ACTION_LEN])
     });
     assert_eq!(seen.len(), 12);
     let mut executed = seen.iter().filter(|o| o.step > 0).map(|o| o.executed_action);
@@ -280,7 +285,7 @@ fn a_stop_ends_the_run_and_tells_the_controller() {
     static STOP: AtomicBool = AtomicBool::new(false);
     let settings = ServeSettings { episodes: None, ..serve_settings("stop") };
     let (tally, seen) = run(&settings, &STOP, |link| {
-        answer_all(&ControllerLink::open(link).unwrap(), |observation| {
+        answer_all(&ControllerLink::open(link, |_| Vec::new()).unwrap(), |observation| {
             STOP.fetch_or(observation.sequence == 8, Ordering::Relaxed);
             [0.0; ACTION_LEN]
         })

@@ -1,7 +1,7 @@
 use std::sync::atomic::{AtomicBool, Ordering};
 
-use rcwm_models::ACTION_LEN;
 use rcwm_models::episode::{Episode, EpisodeBuilder, EpisodeError};
+use rcwm_models::interface::NotFinite;
 use rcwm_models::wire::{ObservationFlags, ObservationSample};
 
 use super::policy::PolicyInput;
@@ -16,6 +16,9 @@ pub enum FleetError {
     /// Observations that make no episode.
     #[error(transparent)]
     Episode(#[from] EpisodeError),
+    /// A policy that gives numbers that are none.
+    #[error("an action of the policy: {0}")]
+    NotFinite(#[from] NotFinite),
     /// There is none.
     #[error(
         "there is no simulator to act in; set finetune.simulators to 1 or more, or join one with --join INSTANCE"
@@ -47,11 +50,17 @@ impl Gathered {
     /// What a policy decides by.
     #[must_use]
     pub fn seen(&self) -> PolicyInput<'_> {
+        let observation = self.observation.view();
+        let mut executed = observation.executed_action();
+        if observation.format().normaliser().from_units(observation.executed(), &mut executed).is_err() {
+            // What is not finite is refused where it is recorded.
+            executed.fill(0.0);
+        }
         PolicyInput {
             simulator: self.simulator,
             first: self.is_first(),
-            image: &self.observation.image,
-            executed: self.observation.executed_action,
+            image: observation.image(0),
+            executed,
         }
     }
 
@@ -130,8 +139,12 @@ impl Fleet {
         Ok(gathered)
     }
 
-    /// Answers an observation.
-    pub fn answer(&mut self, to: &Gathered, action: [f32; ACTION_LEN]) -> Result<(), FleetError> {
+    /// Answers an observation with an action in [-1, 1]; one without numbers is the middle of the limits.
+    pub fn answer(&mut self, to: &Gathered, action: &[f32]) -> Result<(), FleetError> {
+        let format = to.observation.view().format();
+        let (mut units, middle) = (format.zeros(), format.zeros());
+        let action = if action.is_empty() { &*middle } else { action };
+        let action = format.normaliser().to_units(action, &mut units).map(|()| units)?;
         match &mut self.members[to.simulator].client {
             Some(client) => Ok(client.answer(to.observation.sequence, action)?),
             None => Ok(()),
@@ -149,7 +162,7 @@ impl Fleet {
             *builder = EpisodeBuilder::new();
         }
         if gathered.is_first() || !builder.is_empty() {
-            builder.push(&gathered.observation)?;
+            builder.push(&gathered.observation.view())?;
         }
         if !gathered.is_last() {
             return Ok(None);

@@ -1,5 +1,6 @@
 use candle_core::{Device, Result, Tensor};
-use rcwm_models::{ACTION_LEN, IMAGE_CHANNELS, IMAGE_SIDE};
+use rcwm_models::wire::ActionValues;
+use rcwm_models::{IMAGE_CHANNELS, IMAGE_SIDE};
 
 use super::filter_step;
 use crate::model::agent::Agent;
@@ -15,14 +16,14 @@ pub struct PolicyInput<'a> {
     /// u8 [64, 64, 3].
     pub image: &'a [u8],
     /// The action that led here.
-    pub executed: [f32; ACTION_LEN],
+    pub executed: ActionValues,
 }
 
 /// What one simulator is to do.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct Decision {
     /// Each in [-1, 1].
-    pub action: [f32; ACTION_LEN],
+    pub action: ActionValues,
     /// Whether the policy gave a number that is not finite: zeros stand for its action then, and the state begins anew.
     pub refused: bool,
 }
@@ -57,11 +58,14 @@ impl Policy {
             })
             .collect();
         let images: Vec<u8> = seen.iter().flat_map(|one| one.image.iter().copied()).collect();
-        let actions: Vec<f32> =
-            seen.iter().flat_map(|one| if one.first { [0.0; ACTION_LEN] } else { one.executed }).collect();
+        let mut actions = Vec::with_capacity(seen.len() * seen[0].executed.len());
+        for one in seen {
+            let executed = if one.first { ActionValues::zeros(one.executed.len()) } else { one.executed };
+            actions.extend_from_slice(&executed);
+        }
         let shape = (seen.len(), IMAGE_SIDE, IMAGE_SIDE, IMAGE_CHANNELS);
         let images = Tensor::from_vec(images, shape, &self.device)?;
-        let actions = Tensor::from_vec(actions, (seen.len(), ACTION_LEN), &self.device)?;
+        let actions = Tensor::from_vec(actions, (seen.len(), seen[0].executed.len()), &self.device)?;
         let states = filter_step(&self.agent.world, &rows(&before)?, &images, &actions, sampler)?;
         let decided = self.agent.actor.forward(&states.features()?)?.sample(sampler)?.to_vec2::<f32>()?;
         let mut decisions = Vec::with_capacity(seen.len());
@@ -69,7 +73,7 @@ impl Policy {
             let refused = action.iter().any(|x| !x.is_finite());
             let state = if refused { None } else { Some(states.map(|x| x.narrow(0, row, 1))?) };
             self.states[one.simulator] = state;
-            let action = std::array::from_fn(|i| if refused { 0.0 } else { action[i].clamp(-1.0, 1.0) });
+            let action = action.into_iter().map(|x| if refused { 0.0 } else { x.clamp(-1.0, 1.0) }).collect();
             decisions.push(Decision { action, refused });
         }
         Ok(decisions)

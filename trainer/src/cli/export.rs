@@ -8,6 +8,7 @@ use candle_core::Device;
 use clap::ValueEnum;
 use indicatif::{ProgressBar, ProgressStyle};
 use rcwm_models::bundle::{Bundle, PartName};
+use rcwm_models::interface::Interface;
 use rcwm_models::tasks;
 use rcwm_trainer::checkpoint::{Checkpoint, CheckpointError, SETTINGS_FILE};
 use rcwm_trainer::export::{self, ExportError, Options, Progress};
@@ -42,9 +43,12 @@ pub struct Export {
     /// Round weights to what 16 bits hold: a checkpoint takes half the space, a bundle compresses to half
     #[arg(long)]
     half: bool,
-    /// Decisions a second the policy was trained for
-    #[arg(long, default_value_t = 40.0)]
-    rate_hz: f64,
+    /// The robot that the policy is for, a file with [interface]; Meta-World's arm without one
+    #[arg(long, value_name = "ROBOT.TOML")]
+    interface: Option<PathBuf>,
+    /// Decisions a second, where they are others than the interface's
+    #[arg(long, value_name = "HZ")]
+    rate_hz: Option<f64>,
     /// Make the golden values from the images of this episode (.npz) instead of synthetic ones
     #[arg(long, value_name = "FILE")]
     golden_episode: Option<PathBuf>,
@@ -93,6 +97,13 @@ struct PartSize<'a> {
 }
 
 impl Export {
+    fn interface(&self) -> Result<Interface> {
+        let mut interface =
+            self.interface.as_deref().map_or_else(|| Ok(Interface::metaworld()), Interface::read)?;
+        interface.rate_hz = self.rate_hz.unwrap_or(interface.rate_hz);
+        Ok(interface)
+    }
+
     pub fn run(self) -> Result<ExitCode> {
         super::prepare_json(self.json.as_deref())?;
         if self.form == Form::Checkpoint {
@@ -121,7 +132,7 @@ impl Export {
         }
         let options = Options {
             task: self.task.clone(),
-            rate_hz: self.rate_hz,
+            interface: self.interface()?,
             parts: match self.parts {
                 Parts::All => PartName::ALL.to_vec(),
                 Parts::Required => PartName::REQUIRED.to_vec(),

@@ -5,12 +5,12 @@ use std::io;
 use std::path::{Path, PathBuf};
 
 use ndarray::{ArrayD, IxDyn};
-use rcwm_models::ACTION_LEN;
 use rcwm_models::bundle::{
-    ActionMode, Bundle, Control, FORMAT, FileEntry, InitialState, MANIFEST_FILE, Manifest, PartEntry,
-    PartName, Provenance,
+    Bundle, BundleKind, FORMAT, FileEntry, InitialState, MANIFEST_FILE, Manifest, PartEntry, PartName,
+    PolicyInputs, Provenance,
 };
 use rcwm_models::files::{sha256_hex, write_atomic};
+use rcwm_models::interface::Interface;
 use rcwm_models::tensors::{Tensors, Values};
 use rustix::fs::{CWD, RenameFlags, renameat_with};
 
@@ -31,8 +31,8 @@ const GOLDEN_FILE: &str = "golden.safetensors";
 pub struct Options {
     /// Task the policy was made for, or `own`.
     pub task: String,
-    /// Decisions a second, in Hz.
-    pub rate_hz: f64,
+    /// The robot that the policy is for.
+    pub interface: Interface,
     /// The parts; those of [`PartName::REQUIRED`] at least.
     pub parts: Vec<PartName>,
     /// Episode for the golden values; synthetic images without one.
@@ -91,12 +91,9 @@ pub fn write(
         format: FORMAT,
         task: options.task.clone(),
         model: settings.clone(),
-        control: Control {
-            rate_hz: options.rate_hz,
-            action_low: [-1.0; ACTION_LEN],
-            action_high: [1.0; ACTION_LEN],
-            action_mode: ActionMode::default(),
-        },
+        kind: BundleKind::Rcwm,
+        interface: options.interface.clone(),
+        policy: PolicyInputs { inputs: inputs_of(&options.interface), limits: None },
         provenance: provenance(checkpoint, options, &scene),
         initial,
         golden,
@@ -107,6 +104,11 @@ pub fn write(
     progress.step("moving the bundle to its place", 1, 1)?;
     put_in_place(building, place, replaces)?;
     Ok(Bundle::open(place)?)
+}
+
+/// What the policy reads: the first camera.
+fn inputs_of(interface: &Interface) -> Vec<String> {
+    interface.camera.iter().take(1).map(|camera| camera.name.clone()).collect()
 }
 
 fn provenance(checkpoint: &Checkpoint, options: &Options, scene: &Scene) -> Provenance {

@@ -1,9 +1,9 @@
 use std::sync::atomic::{AtomicBool, Ordering};
 use std::time::Duration;
 
-use rcwm_models::ACTION_LEN;
+use rcwm_models::interface::{Interface, Mismatch};
 use rcwm_models::wire::{
-    Action, ActionSource, ControllerLink, LinkError, LinkSettings, ObservationSample, Wait,
+    Action, ActionSource, ActionValues, ControllerLink, LinkError, LinkSettings, ObservationSample, Wait,
 };
 
 use super::{ProcessError, SimulatorProcess};
@@ -30,16 +30,22 @@ pub struct Client {
     answer: Option<Action>,
 }
 
+/// What the trainer needs of a robot: whatever it offers is recorded.
+fn needs(_: &Interface) -> Vec<Mismatch> {
+    Vec::new()
+}
+
 impl Client {
     /// Connects to the simulator that was started.
     pub fn of(process: SimulatorProcess) -> Result<Self, ClientError> {
-        let link = ControllerLink::open(LinkSettings::new(process.instance()))?;
+        let link = ControllerLink::open(LinkSettings::new(process.instance()), needs)?;
         Ok(Self { link, process: Some(process), answer: None })
     }
 
     /// Connects to a simulator that runs, or will.
     pub fn join(instance: &str) -> Result<Self, ClientError> {
-        Ok(Self { link: ControllerLink::open(LinkSettings::new(instance))?, process: None, answer: None })
+        let link = ControllerLink::open(LinkSettings::new(instance), needs)?;
+        Ok(Self { link, process: None, answer: None })
     }
 
     /// The next observation; `None` when the simulator is done or `stop` was set.
@@ -51,7 +57,7 @@ impl Client {
             match self.link.wait_observation(WAIT_SLICE)? {
                 Wait::Message(observation) => match self.answer {
                     Some(answer) if answer.answers == observation.sequence => {
-                        self.link.send(answer)?;
+                        self.link.send(&answer)?;
                     }
                     _ => return Ok(Some(observation)),
                 },
@@ -76,10 +82,10 @@ impl Client {
     ///
     /// # Errors
     /// [`LinkError::Traffic`].
-    pub fn answer(&mut self, sequence: u64, action: [f32; ACTION_LEN]) -> Result<(), ClientError> {
+    pub fn answer(&mut self, sequence: u64, action: ActionValues) -> Result<(), ClientError> {
         let source = ActionSource::Policy as u32;
-        let answer = Action { answers: sequence, published_ns: 0, source, reserved: 0, action };
-        self.link.send(answer)?;
+        let answer = Action { answers: sequence, published_ns: 0, source, action };
+        self.link.send(&answer)?;
         self.answer = Some(answer);
         Ok(())
     }

@@ -6,11 +6,11 @@ use std::time::Duration;
 
 use rand::{Rng, SeedableRng};
 use rand_chacha::ChaCha8Rng;
-use rcwm_models::ACTION_LEN;
 use rcwm_models::episode::{Episode, EpisodeError};
 use rcwm_models::files::{FileError, free_name};
 use rcwm_models::lock::Lock;
 use rcwm_models::tasks::task_name;
+use rcwm_models::wire::{ActionValues, Format};
 use serde::Serialize;
 
 use super::recorder::{Recorded, Recorder};
@@ -198,7 +198,7 @@ fn run_job(
     })?;
     let mut recorder = Recorder::new(Client::of(process)?);
     // The simulator decides by itself: an answer is a receipt.
-    while let Some(recorded) = recorder.episode(stop, || [0.0; ACTION_LEN], || progress(Progress::Step))? {
+    while let Some(recorded) = recorder.episode(stop, Format::zeros, || progress(Progress::Step))? {
         keep(job, &recorded)?;
         sums.entry((job.task.clone(), job.script.name().to_owned())).or_default().add(&recorded.episode);
         progress(Progress::Episode);
@@ -220,7 +220,13 @@ pub fn record(
     let mut recorder = Recorder::new(Client::join(instance)?);
     let mut sums = Sums::new();
     for _ in 0..episodes {
-        let decide = || std::array::from_fn(|_| random.random_range(-1.0..=1.0));
+        let decide = |format: &Format| {
+            let chosen = ActionValues::from_fn(format.action_numbers(), |_| random.random_range(-1.0..=1.0));
+            let mut units = format.zeros();
+            // Finite: drawn from [-1, 1].
+            let _ = format.normaliser().to_units(&chosen, &mut units);
+            units
+        };
         let recorded = recorder.episode(stop, decide, || progress(Progress::Step))?;
         let Some(Recorded { number, task, episode }) = recorded else { break };
         let folder = out.join(task_name(task));

@@ -1,8 +1,7 @@
 use std::sync::atomic::AtomicBool;
 
-use rcwm_models::ACTION_LEN;
 use rcwm_models::episode::{Episode, EpisodeBuilder};
-use rcwm_models::wire::ObservationFlags;
+use rcwm_models::wire::{ActionValues, Format, ObservationFlags};
 
 use super::{Client, CollectError};
 
@@ -28,12 +27,12 @@ impl Recorder {
         Self { client, builder: EpisodeBuilder::new() }
     }
 
-    /// The next whole episode, every observation answered by what `decide` says; `None` when the simulator is done or `stop` was
+    /// The next whole episode, every observation answered by what `decide` says, in units; `None` when the simulator is done or `stop` was
     /// set. One that was joined in its middle is let pass.
     pub(super) fn episode(
         &mut self,
         stop: &AtomicBool,
-        mut decide: impl FnMut() -> [f32; ACTION_LEN],
+        mut decide: impl FnMut(&Format) -> ActionValues,
         step: impl Fn(),
     ) -> Result<Option<Recorded>, CollectError> {
         while let Some(observation) = self.client.next(stop)? {
@@ -41,10 +40,10 @@ impl Recorder {
                 self.builder = EpisodeBuilder::new();
             }
             if observation.is(ObservationFlags::FIRST) || !self.builder.is_empty() {
-                self.builder.push(&observation)?;
+                self.builder.push(&observation.view())?;
                 step();
             }
-            self.client.answer(observation.sequence, decide())?;
+            self.client.answer(observation.sequence, decide(observation.view().format()))?;
             if !observation.is(ObservationFlags::LAST) {
                 continue;
             }

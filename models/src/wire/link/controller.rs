@@ -16,7 +16,7 @@ use super::observer::{await_robot, observation_of};
 use super::{Ipc, LinkError, LinkSettings, Wait};
 use crate::interface::{Interface, Mismatch};
 use crate::wire::clock::monotonic_ns;
-use crate::wire::{Action, ActionHeader, Format, ObservationSample, ObservationHeader};
+use crate::wire::{Action, ActionHeader, Format, ObservationHeader, ObservationSample};
 
 /// Everything in which a robot is not what a controller needs; empty where it fits.
 pub type Needs = Box<dyn Fn(&Interface) -> Vec<Mismatch> + Send>;
@@ -88,8 +88,7 @@ impl ControllerLink {
         let format = Format::of(interface);
         let bytes = format.layout().action_bytes;
         let instance = self.settings.instance.as_str();
-        let topic =
-            |name| Topic { instance, name, interface_hash: Some(format.hash()), history: false };
+        let topic = |name| Topic { instance, name, interface_hash: Some(format.hash()), history: false };
         let (observations, actions) = reserve_new(&self.settings, bytes, || {
             let observations = Direction::open(&self.node, &topic("observation"))?.receiver()?;
             Ok((observations, Direction::open(&self.node, &topic("action"))?.sender("controller", bytes)?))

@@ -78,7 +78,9 @@ pub enum LinkError {
     #[error("instance {instance}: the robot's {source}")]
     NoInterface { instance: String, source: InterfaceError },
     /// A message of another length than the interface gives it.
-    #[error("{service}: a message of {found} bytes, expected {expected}; the peer does not keep to the interface")]
+    #[error(
+        "{service}: a message of {found} bytes, expected {expected}; the peer does not keep to the interface"
+    )]
     MessageLength { service: &'static str, found: usize, expected: usize },
     /// The place is taken.
     #[error("{service}: another {role} is already connected; stop it or choose another --instance")]

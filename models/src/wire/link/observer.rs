@@ -11,7 +11,7 @@ use super::direction::{Direction, Received, Receiver, Topic};
 use super::domain::join;
 use super::{Ipc, LinkError, LinkSettings, Wait};
 use crate::interface::Interface;
-use crate::wire::{Action, ActionHeader, ActionValues, Format, ObservationSample, ObservationHeader};
+use crate::wire::{Action, ActionHeader, ActionValues, Format, ObservationHeader, ObservationSample};
 
 /// How often a robot that is not there yet, or did not listen, is asked again.
 const ASK_EVERY: Duration = Duration::from_millis(250);

@@ -11,7 +11,7 @@ use super::domain::join;
 use super::observer::action_of;
 use super::{Events, Ipc, LinkError, LinkSettings, Wait};
 use crate::wire::clock::monotonic_ns;
-use crate::wire::{Action, ActionHeader, Format, ObservationHeader, ObservationMut};
+use crate::wire::{Action, ActionHeader, Format, ObservationHeader, ObservationMut, OwnedObservation};
 
 /// The simulator's end (or a robot's): publishes observations, receives actions.
 pub struct SimulatorLink {
@@ -49,8 +49,7 @@ impl SimulatorLink {
             let (instance, interface_hash) = (settings.instance.as_str(), Some(format.hash()));
             let topic = |name| Topic { instance, name, interface_hash, history: false };
             let actions = Direction::open(&node, &topic("action"))?.receiver()?;
-            let observations =
-                Direction::open(&node, &topic("observation"))?.sender("simulator", bytes)?;
+            let observations = Direction::open(&node, &topic("observation"))?.sender("simulator", bytes)?;
             let announcer = Announcer::open(&node, instance, format)?;
             Ok(Self { settings, format: Arc::clone(format), announcer, observations, actions, node })
         })?;
@@ -71,6 +70,14 @@ impl SimulatorLink {
         let mut slot = self.slot()?;
         fill(&mut slot.edit());
         self.send(slot)
+    }
+
+    /// Publishes a copy. `published_ns` is that of now.
+    ///
+    /// # Errors
+    /// [`LinkError::Traffic`].
+    pub fn publish_copy(&self, observation: &OwnedObservation) -> Result<(), LinkError> {
+        self.publish(|slot| slot.copy(&observation.view()))
     }
 
     /// A place in shared memory of zeros, to be filled and sent.

@@ -16,9 +16,9 @@ pub use report::{BenchReport, CaseBench, Step};
 
 use std::time::{Duration, Instant};
 
-use rcwm_models::ACTION_LEN;
 use rcwm_models::bundle::Bundle;
 use rcwm_models::tensors::TensorsError;
+use rcwm_models::wire::ActionValues;
 
 use crate::inspect::{Cost, CostError, InspectError, inspect};
 use crate::plot::{Curve, PlotError, plot};

@@ -16,6 +16,7 @@ mod panels;
 
 use std::path::{Path, PathBuf};
 
+use rcwm_models::IMAGE_BYTES;
 use rcwm_models::bundle::PartName;
 use rcwm_models::files::FileError;
 use rcwm_models::lock::{Lock, LockError};
@@ -48,6 +49,9 @@ pub enum FilmError {
     /// An episode could not be written.
     #[error("film: {0}")]
     Episode(#[from] rcwm_models::episode::EpisodeError),
+    /// Pictures of another size.
+    #[error("film: pictures of {found} bytes; films are drawn of 64 x 64 x 3 ({expected} bytes)")]
+    Size { found: usize, expected: usize },
     /// Somebody else writes into the folder.
     #[error("film: {0}")]
     Lock(#[from] LockError),
@@ -155,7 +159,7 @@ impl<'a> Filming<'a> {
     fn load_decoder(&mut self) -> Result<(), FilmError> {
         let Some(replayer) = &self.replayer else { return Ok(()) };
         let bundle = replayer.bundle();
-        self.rate_hz = bundle.manifest.control.rate_hz;
+        self.rate_hz = bundle.manifest.interface.rate_hz;
         let part = bundle.part(PartName::Decoder);
         self.decoder =
             part.map(|_| engine::load(bundle, PartName::Decoder, replayer.engine())).transpose()?;
@@ -169,14 +173,14 @@ impl<'a> Filming<'a> {
         match entry {
             Entry::Policy(_) => self.load_decoder(),
             Entry::Tick(tick) => match &tick.observation {
-                Some(observation) => self.tick(tick, observation),
+                Some(observation) => self.tick(tick, &observation.view()),
                 // A tick without an observation has nothing to show.
                 None => Ok(()),
             },
         }
     }
 
-    fn tick(&mut self, tick: &LoggedTick, observation: &Observation) -> Result<(), FilmError> {
+    fn tick(&mut self, tick: &LoggedTick, observation: &Observation<'_>) -> Result<(), FilmError> {
         if tick.record.is_first {
             self.finish()?;
             self.episodes_left = self.episodes_left.and_then(|left| left.checked_sub(1));
@@ -190,8 +194,12 @@ impl<'a> Filming<'a> {
         }
         let running = self.running.get_or_insert_with(|| Running::start(observation));
         running.result.add(observation);
+        let image = observation.image(0);
+        if image.len() != IMAGE_BYTES {
+            return Err(FilmError::Size { found: image.len(), expected: IMAGE_BYTES });
+        }
         let shown = Shown {
-            image: &observation.image,
+            image,
             decoded: self.decoder.is_some().then_some(&self.decoded),
             action: tick.record.answer.action,
             source: tick.record.answer.source,
@@ -247,7 +255,7 @@ impl<'a> Filming<'a> {
 }
 
 impl Running {
-    fn start(observation: &Observation) -> Self {
+    fn start(observation: &Observation<'_>) -> Self {
         Self {
             film: Vec::new(),
             panels: Vec::new(),

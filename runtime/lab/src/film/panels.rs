@@ -8,7 +8,8 @@
 //! Without a decoder only the left column. Branches are shown multiplied by their masks (eq. 8).
 
 use rcwm_models::wire::ActionSource;
-use rcwm_models::{ACTION_LEN, IMAGE_BYTES, IMAGE_SIDE, MASK_BYTES};
+use rcwm_models::wire::ActionValues;
+use rcwm_models::{IMAGE_BYTES, IMAGE_SIDE, MASK_BYTES};
 
 use super::canvas::{Canvas, LETTER_HEIGHT};
 
@@ -115,7 +116,7 @@ fn action_panel(canvas: &mut Canvas, x: usize, y: usize, shown: &Shown<'_>) {
     let (label, colour) = if policy { ("ACTION", BAR) } else { ("ACTION FALLBACK", BAR_FALLBACK) };
     canvas.text(x, y - LABEL, label, LETTERS);
     let middle = y + IMAGE_SIDE / 2;
-    let slot = IMAGE_SIDE / ACTION_LEN;
+    let slot = (IMAGE_SIDE / shown.action.len().max(1)).max(2);
     for (index, value) in shown.action.iter().enumerate() {
         let length = (value.abs().min(1.0) * (IMAGE_SIDE / 2) as f32).round() as usize;
         let top = if *value > 0.0 { middle - length } else { middle };

@@ -74,15 +74,17 @@ impl BundleInfo {
     }
 
     fn heading(&self) -> String {
-        let Manifest { task, model, control, provenance, .. } = &self.manifest;
+        let Manifest { task, model, interface, provenance, .. } = &self.manifest;
+        let limits = self.manifest.limits();
         format!(
-            "task       {task}, {} Hz, actions {:?} to {:?}\n\
+            "task       {task}, robot {} at {} Hz, actions {:?} to {:?}\n\
              model      {} preset: {} categoricals of {} classes, deterministic width {}, cnn depth {}, hidden {}, units {}\n\
              origin     {}; {} updates, seeds {:?}, source {}\n\
              golden     {} ticks\n",
-            control.rate_hz,
-            control.action_low,
-            control.action_high,
+            interface.name,
+            interface.rate_hz,
+            limits.low,
+            limits.high,
             provenance.preset,
             model.categoricals,
             model.classes,

@@ -62,8 +62,8 @@ pub fn write_episodes(
             if tick.record.is_first {
                 finish(running.take(), &mut written)?;
             }
-            let now = running.get_or_insert_with(|| LoggedEpisode::start(observation));
-            now.add(observation, tick.record.dropped_before > 0 && !tick.record.is_first);
+            let now = running.get_or_insert_with(|| LoggedEpisode::start(&observation.view()));
+            now.add(&observation.view(), tick.record.dropped_before > 0 && !tick.record.is_first);
             if observation.is(ObservationFlags::LAST) {
                 finish(running.take(), &mut written)?;
             }
@@ -79,13 +79,13 @@ pub fn write_episodes(
 impl LoggedEpisode {
     /// One that begins with this observation, which is not added yet.
     #[must_use]
-    pub fn start(observation: &Observation) -> Self {
+    pub fn start(observation: &Observation<'_>) -> Self {
         let task = task_name(observation.task);
         Self { builder: EpisodeBuilder::new(), task, next_step: observation.step, broken: false }
     }
 
     /// Adds an observation; after a `gap`, or another step than the next, the episode is broken.
-    pub fn add(&mut self, observation: &Observation, gap: bool) {
+    pub fn add(&mut self, observation: &Observation<'_>, gap: bool) {
         // A transition over a gap would teach the trainer a dynamics that does not exist.
         self.broken |= gap || observation.step != self.next_step;
         self.next_step = observation.step.wrapping_add(1);

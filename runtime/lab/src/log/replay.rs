@@ -4,9 +4,9 @@ use std::collections::VecDeque;
 use std::path::PathBuf;
 use std::time::Instant;
 
-use rcwm_models::ACTION_LEN;
 use rcwm_models::bundle::Bundle;
 use rcwm_models::wire::ActionSource;
+use rcwm_models::wire::ActionValues;
 
 use rcwm_runtime::EngineSettings;
 use rcwm_runtime::controller::SafetyFilter;
@@ -66,7 +66,7 @@ impl Replayer {
             engine,
             bundles,
             running,
-            filter: SafetyFilter::new(&policy.manifest().control, header.rate_max),
+            filter: SafetyFilter::new(policy.limits(), header.rate_max),
             policy,
             telemetry: Telemetry::new(),
             report,
@@ -144,7 +144,7 @@ impl Replayer {
     fn exchange(&mut self, identity: &BundleIdentity) -> Result<(), ReplayError> {
         (self.running, self.policy) = load(&self.bundles, identity, &self.report.log, self.engine)?;
         self.states.clear();
-        self.filter.take_limits(&self.policy.manifest().control);
+        self.filter.take_limits(self.policy.limits());
         self.report.swaps += 1;
         Ok(())
     }
@@ -160,7 +160,7 @@ impl Replayer {
         }
         self.report.ticks_compared += 1;
         let difference = self.calls(tick);
-        let answer = self.answer(record);
+        let answer = self.answer(tick);
         let difference = difference.or_else(|| self.state(record)).or(answer);
         self.resumed = false;
         self.differs(tick, difference);
@@ -183,7 +183,7 @@ impl Replayer {
         });
         (self.resumed, self.last_sent_known) = (true, false);
         self.states.clear();
-        self.executed(&tick.record);
+        self.executed(tick);
         self.sent(&tick.record);
         if !taken {
             let what = "the state after dropped ticks".to_owned();
@@ -228,7 +228,9 @@ impl Replayer {
             (CallKind::WorkAhead, ..) => drop(self.policy.work_ahead(action)),
             (CallKind::Imagine, Some(action), _) => drop(self.policy.imagine(action)),
             (CallKind::Observe, _, Some(observation)) => {
-                drop(self.policy.observe(&observation.image, action))
+                let observation = observation.view();
+                let camera = self.policy.camera(observation.format().interface())?;
+                drop(self.policy.observe(observation.image(camera), action))
             }
             (CallKind::SetState, ..) => self.go_back(&call.outcome)?,
             (CallKind::Imagine, None, _) | (CallKind::Observe, _, None) => return None,
@@ -283,7 +285,7 @@ impl Replayer {
             return (!ahead && logged != replayed)
                 .then(|| ["the policy's outcome".into(), said(logged), said(replayed)]);
         };
-        for (logged, replayed) in action.iter().zip(a) {
+        for (logged, replayed) in action.iter().zip(a.iter()) {
             self.report.action_error_max = self.report.action_error_max.max((logged - replayed).abs());
         }
         let bits = |values: &[f32]| values.iter().map(|value| value.to_bits()).collect::<Vec<_>>();
@@ -300,9 +302,10 @@ impl Replayer {
     }
 
     /// What was sent: the policy's action, or the fallback, through the filter.
-    fn answer(&mut self, record: &TickRecord) -> Option<[String; 3]> {
+    fn answer(&mut self, tick: &LoggedTick) -> Option<[String; 3]> {
+        let record = &tick.record;
         let (fallback, logged) = (self.report.log.fallback, record.answer.action);
-        self.executed(record);
+        self.executed(tick);
         let of_policy = [ActionSource::Policy as u32, ActionSource::Imagined as u32];
         let action = if of_policy.contains(&record.answer.source) {
             self.decided
@@ -317,14 +320,15 @@ impl Replayer {
         };
         let known = self.last_sent_known;
         self.sent(record);
-        let same = replayed.is_some_and(|replayed| replayed.map(f32::to_bits) == logged.map(f32::to_bits));
+        let same = replayed.is_some_and(|replayed| replayed.to_bits() == logged.to_bits());
         (known && !same).then(|| ["the action sent".into(), format!("{logged:?}"), format!("{replayed:?}")])
     }
 
-    fn executed(&mut self, record: &TickRecord) {
-        if let Some(observed) = &record.observed {
-            self.filter.observed(&observed.without_picture(), record.is_first);
-            self.last_sent_known |= record.is_first;
+    fn executed(&mut self, tick: &LoggedTick) {
+        if let Some(observed) = &tick.observation {
+            let is_first = tick.record.is_first;
+            self.filter.observed(&observed.view(), is_first);
+            self.last_sent_known |= is_first;
         }
     }
 

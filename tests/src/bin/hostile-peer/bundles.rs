@@ -4,8 +4,9 @@ use std::path::{Path, PathBuf};
 
 use anyhow::Context;
 use prost::Message;
-use rcwm_models::bundle::{ActionMode, Bundle, MANIFEST_FILE, Manifest, PartName};
+use rcwm_models::bundle::{ActionMode, Bundle, Limits, MANIFEST_FILE, Manifest, PartName};
 use rcwm_models::files::sha256_hex;
+use rcwm_models::interface::{Fallback, FallbackRule};
 use rcwm_models::onnx::{Attribute, Model, Node, Tensor, attribute_type};
 use rcwm_runtime::policy::ActionLimits;
 use rcwm_tests::faults::poisoned_bundle;
@@ -33,11 +34,11 @@ pub(crate) struct Choice {
 impl Choice {
     /// What the judge must know; none where the runtime refuses it.
     pub(crate) fn known(&self) -> Option<Known> {
-        let control = &self.bundle.as_ref()?.manifest.control;
+        let manifest = &self.bundle.as_ref()?.manifest;
         Some(Known {
-            limits: ActionLimits::of(control),
+            limits: ActionLimits::of(manifest),
             is_sound: self.is_sound,
-            is_absolute: control.action_mode == ActionMode::Absolute,
+            is_absolute: manifest.interface.action[0].mode == ActionMode::Absolute,
         })
     }
 }
@@ -68,10 +69,12 @@ impl Bundles {
         for (name, limits, is_absolute) in limits {
             let folder = changed(source, |manifest, _| {
                 if let Some((low, high)) = limits {
-                    (manifest.control.action_low, manifest.control.action_high) = (low, high);
+                    manifest.policy.limits = Some(Limits { low: low.into(), high: high.into() });
                 }
                 if is_absolute {
-                    manifest.control.action_mode = ActionMode::Absolute;
+                    let action = &mut manifest.interface.action[0];
+                    (action.mode, action.fallback) =
+                        (ActionMode::Absolute, Fallback::Rule(FallbackRule::Hold));
                 }
                 Ok(())
             })?;

@@ -4,7 +4,7 @@ use rand::Rng;
 use rand::seq::IndexedRandom;
 use rand_chacha::ChaCha8Rng;
 use rcwm_models::ACTION_LEN;
-use rcwm_models::wire::{Observation, ObservationFlags};
+use rcwm_models::wire::{ActionValues, Format, ObservationFlags, OwnedObservation};
 
 /// Integers at which programs break.
 const HARD: [u64; 12] = [
@@ -253,7 +253,8 @@ impl Draft {
         self.begins = false;
         if rng.random_bool(0.1) {
             self.episode_off = rng.random_range(0..100);
-            self.executed = Executed::Given(std::array::from_fn(|_| rng.random_range(-1.0..1.0)));
+            self.executed =
+                Executed::Given(ActionValues::from_fn(ACTION_LEN, |_| rng.random_range(-1.0..1.0)));
         }
     }
 
@@ -289,7 +290,7 @@ impl Draft {
         match rng.random_range(0..6) {
             0 => self.reward = number,
             1 => self.proprioception = Some((rng.random_range(0..18), number)),
-            2 => self.executed = Executed::Given(std::array::from_fn(|_| hard_float(rng))),
+            2 => self.executed = Executed::Given(ActionValues::from_fn(ACTION_LEN, |_| hard_float(rng))),
             3 => self.executed = Executed::Spoilt(rng.random_range(0..ACTION_LEN), number),
             _ => {}
         }
@@ -314,8 +315,9 @@ impl Draft {
     }
 
     /// Fills the message in, and counts on.
-    pub(crate) fn fill(&self, counts: &mut Counts, now_ns: u64) -> Observation {
-        let mut message = Observation::zeroed();
+    pub(crate) fn fill(&self, counts: &mut Counts, now_ns: u64) -> OwnedObservation {
+        let mut whole = OwnedObservation::zeroed(&Format::metaworld());
+        let mut message = whole.edit();
         if self.begins {
             counts.episode = counts.episode.wrapping_add(1);
             counts.step = 0;
@@ -340,8 +342,8 @@ impl Draft {
         message.scheduled_ns = if self.schedule_too { message.published_ns } else { now_ns };
         message.task = self.task.unwrap_or(rcwm_models::tasks::OWN_TASK);
         message.reward = self.reward;
-        message.executed_action = match self.executed {
-            Executed::AsSent if self.begins => [0.0; ACTION_LEN],
+        let executed = match self.executed {
+            Executed::AsSent if self.begins => [0.0; ACTION_LEN].into(),
             Executed::AsSent => counts.sent,
             Executed::Given(action) => action,
             Executed::Spoilt(at, value) => {
@@ -350,15 +352,18 @@ impl Draft {
                 action
             }
         };
+        message.executed().copy_from_slice(&executed);
         if let Some((at, value)) = self.proprioception {
-            message.proprioception[at] = value;
+            message.state()[at] = value;
         }
-        let (mut word, from) = (self.picture | 1, message.image.len());
-        for place in message.image.iter_mut().take(from) {
+        let mut word = self.picture | 1;
+        for place in message.image(0).iter_mut() {
             word = word.wrapping_mul(1_664_525).wrapping_add(1_013_904_223);
             *place = (word >> 24) as u8;
         }
-        message.robot_mask.fill(self.picture as u8);
-        message
+        if let Some(mask) = message.mask(0) {
+            mask.fill(self.picture as u8);
+        }
+        whole
     }
 }

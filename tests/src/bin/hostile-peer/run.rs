@@ -10,7 +10,7 @@ use std::time::Duration;
 
 use anyhow::Context;
 use rcwm_models::errors::one_line;
-use rcwm_models::wire::{ControllerLink, LinkSettings};
+use rcwm_models::wire::{ControllerLink, Format, LinkSettings, SimulatorLink};
 use rcwm_runtime::controller::{Controller, ControllerError, ControllerSettings, Ended, Fallback};
 use rcwm_runtime::policy::Sampling;
 use rcwm_runtime::swap::{SwapSettings, Swapper};
@@ -71,8 +71,10 @@ pub(crate) fn run(
     let setup = &setup;
     let swaps = steps.iter().any(|(_, step)| matches!(step.deed, Deed::Swap { .. }));
     let swapper = swaps.then(|| swapper(link, setup, &policy)).transpose()?;
-    // The first makes the services as they must be.
-    let controller_link = ControllerLink::open(link.clone())?;
+    // The first two make the services as they must be.
+    let controller_link = ControllerLink::open(link.clone(), |_| Vec::new())?;
+    drop(SimulatorLink::open(link.clone(), &Format::metaworld())?);
+    controller_link.wait_robot(Duration::from_secs(10))?.context("the controller does not find its robot")?;
     let wire = Wire::join(link)?;
     let choices = bundles.all.iter().map(|choice| (choice.folder.clone(), choice.known())).collect();
     let asking = Asking::new(link.clone(), choices, known);
@@ -167,8 +169,9 @@ fn policy<'a>(bundles: &'a Bundles, setup: &Setup) -> anyhow::Result<(&'a Choice
 }
 
 fn swapper(link: &LinkSettings, setup: &Setup, policy: &Policy) -> anyhow::Result<Swapper> {
-    let rate_hz = policy.manifest().control.rate_hz;
-    let settings = SwapSettings { link: link.clone(), engine: engine(), sampling: sampling(setup), rate_hz };
+    let interface = policy.manifest().interface.clone();
+    let settings =
+        SwapSettings { link: link.clone(), engine: engine(), sampling: sampling(setup), interface };
     Ok(Swapper::start(settings)?)
 }
 

@@ -8,6 +8,7 @@ use std::time::Duration;
 use rand::seq::IndexedRandom;
 use rand::{Rng, SeedableRng};
 use rand_chacha::ChaCha8Rng;
+use rcwm_models::wire::ActionValues;
 use rcwm_runtime::controller::{Fallback, SurpriseLimits, TickLimits};
 use rcwm_runtime::pacing::PacingSettings;
 
@@ -116,7 +117,7 @@ fn setup(rng: &mut ChaCha8Rng, bundles: usize) -> Setup {
     let fallback = match rng.random_range(0..4) {
         0 | 1 => Fallback::Hold,
         2 => Fallback::Zero,
-        _ => Fallback::Given(std::array::from_fn(|_| rng.random_range(-1.5..1.5))),
+        _ => Fallback::Given(ActionValues::from_fn(rcwm_models::ACTION_LEN, |_| rng.random_range(-1.5..1.5))),
     };
     let surprise = rng.random_bool(0.2);
     let nats = [None, Some(0.0), Some(0.5), Some(20.0)];

@@ -7,9 +7,14 @@ use iceoryx2::port::publisher::Publisher;
 use iceoryx2::port::subscriber::Subscriber;
 use iceoryx2::prelude::*;
 use iceoryx2::service::port_factory::publish_subscribe::PortFactory;
-use rcwm_models::wire::{Action, LinkSettings, Observation};
+use rcwm_models::wire::{
+    Action, ActionHeader, ActionValues, LinkSettings, ObservationHeader, OwnedObservation,
+};
 
 type Ipc = ipc::Service;
+
+/// More than an observation of Meta-World's arm has.
+const MESSAGE_BYTES_MAX: usize = 1 << 16;
 
 /// Events of the link, by their numbers.
 const PUBLISHED: usize = 0;
@@ -17,11 +22,11 @@ const CLOSED: usize = 2;
 
 /// The bare ports of a robot.
 pub(crate) struct Wire {
-    publisher: Option<Publisher<Ipc, Observation, ()>>,
+    publisher: Option<Publisher<Ipc, [u8], ObservationHeader>>,
     notifier: Notifier<Ipc>,
-    actions: Subscriber<Ipc, Action, ()>,
+    actions: Subscriber<Ipc, [u8], ActionHeader>,
     events: Listener<Ipc>,
-    observations: PortFactory<Ipc, Observation, ()>,
+    observations: PortFactory<Ipc, [u8], ObservationHeader>,
     // Dropped last: the ports above belong to it.
     _node: Node<Ipc>,
 }
@@ -49,11 +54,18 @@ impl Wire {
         let (observation, action) = (name("observation")?, name("action")?);
         let observations = node
             .service_builder(&observation)
-            .publish_subscribe::<Observation>()
+            .publish_subscribe::<[u8]>()
+            .user_header::<ObservationHeader>()
+            .payload_alignment(Alignment::ALIGN_64)
             .open()
             .map_err(failed("observations"))?;
-        let answers =
-            node.service_builder(&action).publish_subscribe::<Action>().open().map_err(failed("actions"))?;
+        let answers = node
+            .service_builder(&action)
+            .publish_subscribe::<[u8]>()
+            .user_header::<ActionHeader>()
+            .payload_alignment(Alignment::ALIGN_64)
+            .open()
+            .map_err(failed("actions"))?;
         let wake = node.service_builder(&observation).event().open().map_err(failed("events"))?;
         let woken = node.service_builder(&action).event().open().map_err(failed("events"))?;
         let mut wire = Self {
@@ -72,7 +84,8 @@ impl Wire {
     pub(crate) fn restart(&mut self) -> anyhow::Result<()> {
         // The service takes one publisher at a time.
         self.publisher = None;
-        let publisher = self.observations.publisher_builder().create();
+        let publisher =
+            self.observations.publisher_builder().initial_max_slice_len(MESSAGE_BYTES_MAX).create();
         self.publisher = Some(publisher.map_err(failed("the publisher"))?);
         Ok(())
     }
@@ -83,10 +96,13 @@ impl Wire {
     }
 
     /// Publishes as it is; without `wake` the controller finds it when it next looks.
-    pub(crate) fn publish(&self, observation: Observation, wake: bool) -> anyhow::Result<()> {
+    pub(crate) fn publish(&self, observation: &OwnedObservation, wake: bool) -> anyhow::Result<()> {
         let publisher = self.publisher.as_ref().context("a publisher")?;
-        let sample = publisher.loan_uninit().map_err(failed("loaning an observation"))?;
-        sample.write_payload(observation).send().map_err(failed("publishing an observation"))?;
+        let payload = observation.view().payload();
+        let sample = publisher.loan_slice_uninit(payload.len()).map_err(failed("loaning an observation"))?;
+        let mut sample = sample.write_from_slice(payload);
+        *sample.user_header_mut() = **observation;
+        sample.send().map_err(failed("publishing an observation"))?;
         if wake {
             self.notify(PUBLISHED)?;
         }
@@ -107,7 +123,12 @@ impl Wire {
     /// The newest action on the wire.
     pub(crate) fn action(&self) -> anyhow::Result<Option<Action>> {
         let sample = self.actions.receive().map_err(failed("receiving an action"))?;
-        Ok(sample.map(|sample| *sample.payload()))
+        Ok(sample.map(|sample| {
+            let ActionHeader { answers, published_ns, source, .. } = *sample.user_header();
+            let number = |bytes: &[u8; 4]| f32::from_ne_bytes(*bytes);
+            let action = sample.payload().as_chunks().0.iter().map(number).collect::<ActionValues>();
+            Action { answers, published_ns, source, action }
+        }))
     }
 
     /// Whether the controller has said since the last look that no action will come.

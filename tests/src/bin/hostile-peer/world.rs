@@ -10,7 +10,7 @@ use std::time::Duration;
 
 use rand::{Rng, SeedableRng};
 use rand_chacha::ChaCha8Rng;
-use rcwm_models::wire::{Action, ControllerLink, LinkError, Observation, Wait};
+use rcwm_models::wire::{Action, ActionValues, ControllerLink, LinkError, ObservationSample, Wait};
 use rcwm_runtime::controller::{Tick, TickObserver, Transport};
 
 use crate::asking::{Asking, Said};
@@ -81,8 +81,10 @@ impl World {
     ) -> Self {
         let mut rng = ChaCha8Rng::seed_from_u64(seed ^ 0x77);
         // Another controller had the robot before this one.
-        let counts =
-            Counts { sent: std::array::from_fn(|_| rng.random_range(-1.0..1.0)), ..Counts::default() };
+        let counts = Counts {
+            sent: ActionValues::from_fn(rcwm_models::ACTION_LEN, |_| rng.random_range(-1.0..1.0)),
+            ..Counts::default()
+        };
         Self {
             wire,
             judge,
@@ -151,8 +153,8 @@ impl World {
                 let message = draft.fill(&mut self.counts, self.now_ns);
                 self.messages += 1;
                 self.events += u32::from(draft.wakes);
-                self.waiting = Some(Heard::new(self.wire.publisher(), &message, self.now_ns));
-                self.wire.publish(message, draft.wakes)
+                self.waiting = Some(Heard::new(self.wire.publisher(), &message.view(), self.now_ns));
+                self.wire.publish(&message, draft.wakes)
             }
             Deed::Close => {
                 self.closing = true;
@@ -233,9 +235,9 @@ impl World {
         }
     }
 
-    fn received(&mut self, sample: &Observation, polled: bool) {
+    fn received(&mut self, sample: &ObservationSample, polled: bool) {
         self.waiting = None;
-        self.judge.received(Heard::new(sample.origin(), sample.payload(), self.now_ns), polled);
+        self.judge.received(Heard::new(sample.origin(), &sample.view(), self.now_ns), polled);
     }
 
     fn sent(&mut self) {
@@ -272,7 +274,7 @@ impl Transport for Stage {
         self.world.borrow_mut().clock()
     }
 
-    fn wait(&self, _spin: Duration, timeout: Duration) -> Result<Wait<Observation>, LinkError> {
+    fn wait(&self, _spin: Duration, timeout: Duration) -> Result<Wait<ObservationSample>, LinkError> {
         let mut world = self.world.borrow_mut();
         let waited = match world.wait(timeout) {
             Waited::Nothing => return Ok(Wait::TimedOut),
@@ -290,7 +292,7 @@ impl Transport for Stage {
         Ok(waited)
     }
 
-    fn poll(&self) -> Result<Option<Observation>, LinkError> {
+    fn poll(&self) -> Result<Option<ObservationSample>, LinkError> {
         let mut world = self.world.borrow_mut();
         let until_ns = world.now_ns + 200;
         world.pass(until_ns);
@@ -304,7 +306,7 @@ impl Transport for Stage {
         Ok(polled)
     }
 
-    fn send(&self, action: Action) -> Result<u64, LinkError> {
+    fn send(&self, action: &Action) -> Result<u64, LinkError> {
         self.link.send(action)?;
         let mut world = self.world.borrow_mut();
         world.sent();

@@ -18,7 +18,7 @@ use std::time::{Duration, Instant};
 use anyhow::Context;
 use clap::Parser;
 use rcwm_models::bundle::Bundle;
-use rcwm_models::wire::{LinkSettings, SimulatorLink, forget_prefix, list_leftovers};
+use rcwm_models::wire::{Format, LinkSettings, SimulatorLink, forget_prefix, list_leftovers};
 use rcwm_runtime::swap::{Answer, When, ask};
 use rcwm_tests::campaign;
 use rcwm_tests::stream::Stream;
@@ -99,7 +99,7 @@ fn run(arguments: &Arguments) -> anyhow::Result<bool> {
     let folder = arguments.keep.as_deref().unwrap_or(temporary.path());
     std::fs::create_dir_all(folder).with_context(|| folder.display().to_string())?;
     let bundle = Bundle::open(&arguments.bundle)?;
-    let peer = SimulatorLink::open(link.clone())?;
+    let peer = SimulatorLink::open(link.clone(), &Format::metaworld())?;
     let mut stream = Stream::new(&peer, &bundle, arguments.rate_hz, arguments.episode)?;
     let mut controller = Running(start_run(arguments, &link, folder)?);
     stream.wait_for_controller(&stop)?;

@@ -1,6 +1,7 @@
 //! `evaluate --task`: success in the simulator.
 
 use super::*;
+use rcwm_models::interface::Interface;
 
 impl Evaluate {
     pub(super) fn closed_loop(&self, stop: &AtomicBool) -> Result<()> {
@@ -74,7 +75,7 @@ impl Evaluate {
         let place = folder.join("bundle");
         let options = Options {
             task: self.tasks.first().cloned().unwrap_or_default(),
-            rate_hz: 40.0,
+            interface: Interface::metaworld(),
             parts: PartName::REQUIRED.to_vec(),
             golden_episode: None,
             golden_ticks: 1,

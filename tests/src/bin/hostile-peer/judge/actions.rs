@@ -12,7 +12,7 @@ impl Judge {
     /// An action is on the wire. `waiting` is the message in the link that the controller has not taken.
     pub(crate) fn sent(&mut self, action: &Action, waiting: Option<&Heard>, now_ns: u64) {
         self.sent.all += 1;
-        (action.answers, action.source, action.action.map(f32::to_bits)).hash(&mut self.digest);
+        (action.answers, action.source, action.action.to_bits()).hash(&mut self.digest);
         let Some(source) = ActionSource::from_wire(action.source) else {
             return self.object("marked", || format!("an unknown source: {action:?}"));
         };

@@ -27,7 +27,7 @@ pub(crate) struct Heard {
 }
 
 impl Heard {
-    pub(crate) fn new(publisher: u128, message: &Observation, received_ns: u64) -> Self {
+    pub(crate) fn new(publisher: u128, message: &Observation<'_>, received_ns: u64) -> Self {
         Self {
             publisher,
             sequence: message.sequence,
@@ -36,7 +36,7 @@ impl Heard {
             period_ns: message.period_ns,
             scheduled_ns: message.scheduled_ns,
             published_ns: message.published_ns,
-            executed: message.executed_action,
+            executed: message.executed_action(),
             is_finite: message.is_finite(),
             received_ns,
             taken_ns: received_ns,

@@ -13,8 +13,7 @@ mod values;
 
 use std::hash::{DefaultHasher, Hasher};
 
-use rcwm_models::ACTION_LEN;
-use rcwm_models::wire::Action;
+use rcwm_models::wire::{Action, ActionValues};
 use rcwm_runtime::controller::Counters;
 
 use due::Due;

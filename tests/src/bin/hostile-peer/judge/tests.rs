@@ -2,7 +2,8 @@
 
 use std::time::Duration;
 
-use rcwm_models::wire::{ActionSource, Observation};
+use rcwm_models::ACTION_LEN;
+use rcwm_models::wire::{ActionSource, Format, OwnedObservation};
 use rcwm_runtime::controller::{Fallback, SurpriseLimits, TickLimits};
 use rcwm_runtime::pacing::PacingSettings;
 use rcwm_runtime::policy::ActionLimits;
@@ -11,7 +12,10 @@ use super::due::LOOKS_MAX;
 use super::*;
 
 const PERIOD_NS: u64 = 1_000_000;
-const LIMITS: ActionLimits = ActionLimits { low: [-0.5; ACTION_LEN], high: [0.5; ACTION_LEN] };
+fn limits(low: f32, high: f32) -> ActionLimits {
+    let all = |x: f32| [x; ACTION_LEN].into();
+    ActionLimits { low: all(low), high: all(high), rate_max: all(f32::INFINITY), absolute: 0 }
+}
 
 fn setup() -> Setup {
     Setup {
@@ -36,7 +40,7 @@ fn known(limits: ActionLimits) -> Known {
 }
 
 fn judge(setup: Setup) -> Judge {
-    Judge::new(setup, known(LIMITS), Vec::new())
+    Judge::new(setup, known(limits(-0.5, 0.5)), Vec::new())
 }
 
 /// When a message of this sequence is published.
@@ -44,19 +48,19 @@ fn at_ns(sequence: u64) -> u64 {
     sequence * PERIOD_NS
 }
 
-fn message(sequence: u64) -> Observation {
-    let mut message = Observation::zeroed();
+fn message(sequence: u64) -> OwnedObservation {
+    let mut message = OwnedObservation::zeroed(&Format::metaworld());
     (message.sequence, message.period_ns) = (sequence, PERIOD_NS);
     (message.scheduled_ns, message.published_ns) = (at_ns(sequence), at_ns(sequence));
     message
 }
 
-fn hear(judge: &mut Judge, message: &Observation) {
-    judge.received(Heard::new(1, message, at_ns(message.sequence)), false);
+fn hear(judge: &mut Judge, message: &OwnedObservation) {
+    judge.received(Heard::new(1, &message.view(), at_ns(message.sequence)), false);
 }
 
 fn action(answers: u64, source: ActionSource, value: f32) -> Action {
-    Action { answers, published_ns: 0, source: source as u32, action: [value; ACTION_LEN] }
+    Action { answers, published_ns: 0, source: source as u32, action: [value; ACTION_LEN].into() }
 }
 
 fn send(judge: &mut Judge, action: Action, now_ns: u64) {
@@ -74,7 +78,7 @@ fn after_one(setup: Setup, then: impl FnOnce(&mut Judge)) -> Option<&'static str
     judge.violation.map(|violation| violation.kind)
 }
 
-fn answer_to_two(value: f32, change: impl FnOnce(&mut Setup, &mut Observation)) -> Option<&'static str> {
+fn answer_to_two(value: f32, change: impl FnOnce(&mut Setup, &mut OwnedObservation)) -> Option<&'static str> {
     let (mut setup, mut second) = (setup(), message(2));
     change(&mut setup, &mut second);
     after_one(setup, |judge| {
@@ -98,7 +102,7 @@ fn numbers_that_are_none_or_out_of_limits_are_seen() {
 
 #[test]
 fn the_new_limits_hold_from_a_swap_on_whatever_the_rate_limit_says() {
-    let narrow = ActionLimits { low: [0.3; ACTION_LEN], high: [0.4; ACTION_LEN] };
+    let narrow = limits(0.3, 0.4);
     let after_swap = |value| {
         after_one(Setup { rate_max: Some(0.1), ..setup() }, |judge| {
             judge.runs_with(known(narrow));
@@ -113,7 +117,7 @@ fn the_new_limits_hold_from_a_swap_on_whatever_the_rate_limit_says() {
 #[test]
 fn what_cannot_be_the_policy_s_is_not_marked_so() {
     assert_eq!(answer_to_two(0.1, |_, second| second.reward = f32::NAN), Some("marked"));
-    assert_eq!(answer_to_two(0.1, |_, second| second.executed_action[0] = 3e38), Some("marked"));
+    assert_eq!(answer_to_two(0.1, |_, second| second.edit().executed()[0] = 3e38), Some("marked"));
     let fallback = after_one(setup(), |judge| {
         hear(judge, &message(2));
         send(judge, action(2, ActionSource::Fallback, 0.1), at_ns(2));
@@ -126,7 +130,8 @@ fn a_fallback_is_the_one_that_was_asked_for() {
     let held = |value| {
         after_one(setup(), |judge| {
             let mut second = message(2);
-            (second.reward, second.executed_action) = (f32::NAN, [0.1; ACTION_LEN]);
+            second.reward = f32::NAN;
+            second.edit().executed().fill(0.1);
             hear(judge, &second);
             send(judge, action(2, ActionSource::Fallback, value), at_ns(2));
         })
@@ -137,10 +142,12 @@ fn a_fallback_is_the_one_that_was_asked_for() {
 #[test]
 fn a_fallback_that_was_given_is_sent_as_far_as_the_limits_allow_even_where_no_position_is_known() {
     let sent = |value| {
-        let setup = Setup { fallback: Fallback::Given([0.9; ACTION_LEN]), rate_max: Some(0.1), ..setup() };
-        let mut judge = Judge::new(setup, Known { is_absolute: true, ..known(LIMITS) }, Vec::new());
+        let setup =
+            Setup { fallback: Fallback::Given([0.9; ACTION_LEN].into()), rate_max: Some(0.1), ..setup() };
+        let mut judge =
+            Judge::new(setup, Known { is_absolute: true, ..known(limits(-0.5, 0.5)) }, Vec::new());
         let mut refused = message(1);
-        refused.executed_action = [3e38; ACTION_LEN];
+        refused.edit().executed().fill(3e38);
         hear(&mut judge, &refused);
         send(&mut judge, action(1, ActionSource::Fallback, value), at_ns(1));
         judge.violation.map(|violation| violation.kind)
@@ -157,7 +164,7 @@ fn an_answer_to_anything_but_the_newest_message_is_stale() {
     assert_eq!(stale, Some("stale"));
     let overtaken = after_one(setup(), |judge| {
         hear(judge, &message(2));
-        let newer = Heard::new(1, &message(4), 0);
+        let newer = Heard::new(1, &message(4).view(), 0);
         judge.looked(at_ns(2));
         judge.looked(at_ns(4));
         judge.sent(&action(2, ActionSource::Policy, 0.1), Some(&newer), at_ns(4));
@@ -173,7 +180,7 @@ fn what_comes_after_the_controller_has_looked_whether_it_is_overtaken_cannot_be_
             judge.looked(at_ns(2));
             judge.looked(at_ns(3) + 1);
             judge.looks_at_link(at_ns(3) + 2, false);
-            let newer = Heard::new(1, &message(4), came_ns);
+            let newer = Heard::new(1, &message(4).view(), came_ns);
             judge.sent(&action(2, ActionSource::Policy, 0.1), Some(&newer), at_ns(3) + 9);
         })
     };
@@ -189,7 +196,7 @@ fn each_of_those_that_may_have_turned_stale_may_be_the_one_that_is_answered() {
             (older.scheduled_ns, older.published_ns) = (at_ns(5), at_ns(5));
             hear(judge, &message(4));
             hear(judge, &message(3));
-            judge.received(Heard::new(1, &older, at_ns(6) + 1), true);
+            judge.received(Heard::new(1, &older.view(), at_ns(6) + 1), true);
             send(judge, action(sequence, ActionSource::Policy, 0.1), at_ns(6) + 2);
         })
     };
@@ -203,7 +210,7 @@ fn a_message_that_comes_again_is_answered_as_it_was_last() {
         after_one(Setup { rate_max: Some(0.1), ..setup() }, |judge| {
             send(judge, action(2, ActionSource::Imagined, 0.2), at_ns(3));
             let mut again = message(1);
-            again.executed_action = [0.4; ACTION_LEN];
+            again.edit().executed().fill(0.4);
             for value in values {
                 hear(judge, &again);
                 send(judge, action(1, ActionSource::Policy, value), at_ns(3));
@@ -226,7 +233,8 @@ fn a_silence_is_believed_only_where_it_is_not_known_what_was_due() {
             send(judge, action(3, ActionSource::Fallback, 0.1), at_ns(4));
             send(judge, action(4, ActionSource::Fallback, 0.1), at_ns(5));
             let mut refused = message(5);
-            (refused.reward, refused.executed_action) = (f32::NAN, [0.1; ACTION_LEN]);
+            refused.reward = f32::NAN;
+            refused.edit().executed().fill(0.1);
             hear(judge, &refused);
             send(judge, action(5, ActionSource::Fallback, 0.1), at_ns(5));
         })
@@ -239,7 +247,8 @@ fn a_silence_is_believed_only_where_it_is_not_known_what_was_due() {
 fn a_new_beginning_is_believed_where_a_message_may_have_been_dropped_or_decided_on() {
     let refused = |sequence| {
         let mut refused = message(sequence);
-        (refused.reward, refused.executed_action) = (f32::NAN, [0.1; ACTION_LEN]);
+        refused.reward = f32::NAN;
+        refused.edit().executed().fill(0.1);
         refused
     };
     let fallbacks_until = |newest, polled| {
@@ -250,7 +259,7 @@ fn a_new_beginning_is_believed_where_a_message_may_have_been_dropped_or_decided_
             }
             // Stale by the time that number 7 comes.
             hear(judge, &message(4));
-            judge.received(Heard::new(1, &refused(newest), at_ns(newest)), polled);
+            judge.received(Heard::new(1, &refused(newest).view(), at_ns(newest)), polled);
             send(judge, action(newest, ActionSource::Fallback, 0.1), at_ns(newest));
         })
     };
@@ -266,7 +275,7 @@ fn a_message_that_was_overtaken_is_what_is_gone_on_from_where_the_newer_one_is_d
             hear(judge, &message(2));
             let mut newer = message(5);
             newer.scheduled_ns = at_ns(2);
-            judge.received(Heard::new(1, &newer, at_ns(4)), polled);
+            judge.received(Heard::new(1, &newer.view(), at_ns(4)), polled);
             judge.looks_at_link(at_ns(4) + 1, false);
             send(judge, action(sequence, ActionSource::Imagined, 0.1), now_ns);
         })
@@ -277,10 +286,10 @@ fn a_message_that_was_overtaken_is_what_is_gone_on_from_where_the_newer_one_is_d
     let held = |value| {
         after_one(Setup { rate_max: Some(0.1), ..setup() }, |judge| {
             let (mut overtaken, mut refused) = (message(2), message(3));
-            overtaken.executed_action = [0.4; ACTION_LEN];
-            refused.executed_action = [3e38; ACTION_LEN];
+            overtaken.edit().executed().fill(0.4);
+            refused.edit().executed().fill(3e38);
             hear(judge, &overtaken);
-            judge.received(Heard::new(1, &refused, at_ns(3)), true);
+            judge.received(Heard::new(1, &refused.view(), at_ns(3)), true);
             send(judge, action(3, ActionSource::Fallback, value), at_ns(3));
         })
     };
@@ -297,7 +306,7 @@ fn a_fallback_may_stand_in_for_a_message_that_has_turned_stale_and_its_answer_co
             let mut again = message(4);
             (again.scheduled_ns, again.published_ns) = (at_ns(7), at_ns(7));
             for value in values {
-                judge.received(Heard::new(1, &again, at_ns(7)), false);
+                judge.received(Heard::new(1, &again.view(), at_ns(7)), false);
                 send(judge, action(4, ActionSource::Policy, value), at_ns(7));
             }
         })

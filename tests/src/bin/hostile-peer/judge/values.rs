@@ -21,7 +21,7 @@ impl Judge {
         bases.extend(&self.unanswered_executed);
         let rests = self.running.iter().any(|running| !running.is_absolute);
         if rests && starts && (newest.heard.flags.contains(ObservationFlags::FIRST) || bases.is_empty()) {
-            bases.push([0.0; ACTION_LEN]);
+            bases.push([0.0; ACTION_LEN].into());
         }
         bases
     }
@@ -29,7 +29,7 @@ impl Judge {
     pub(super) fn check_rate(&mut self, action: &Action) {
         let Some(rate_max) = self.setup.rate_max.filter(|_| !self.is_free) else { return };
         let near = |base: &Vector, limits: &ActionLimits| {
-            let base = base.map(f64::from);
+            let base: Vec<f64> = base.iter().copied().map(f64::from).collect();
             (0..ACTION_LEN).all(|i| {
                 let (low, high) = (f64::from(limits.low[i]), f64::from(limits.high[i]));
                 let slack = 1e-6 * (1.0 + base[i].abs());
@@ -83,7 +83,7 @@ impl Judge {
             // Zeros are no rest where actions are positions.
             Fallback::Zero => {
                 let any = |absolute: bool| self.running.iter().any(|running| running.is_absolute == absolute);
-                any(true) && holds() || any(false) && self.is_made_of(action, &[0.0; ACTION_LEN])
+                any(true) && holds() || any(false) && self.is_made_of(action, &[0.0; ACTION_LEN].into())
             }
             Fallback::Given(target) => self.is_made_of(action, &target),
         };
