@@ -215,7 +215,7 @@ fn what_was_executed_is_held_where_the_policy_has_nothing_fit_to_send() {
     for mode in [ActionMode::Delta, ActionMode::Velocity, ActionMode::Absolute] {
         let bundle = with_manifest(|manifest| rcwm_testkit::set_mode(manifest, mode));
         let link = own_link();
-        let peer = link.peer();
+        let peer = link.peer_of(bundle.path());
         let controller = start_controller_with(bundle.path(), &link, |settings| {
             settings.surprise.robot_max = Some(0.0);
         });
@@ -237,7 +237,7 @@ fn what_was_executed_is_held_where_the_policy_has_nothing_fit_to_send() {
 fn a_position_is_held_across_episodes_and_never_replaced_by_zeros() {
     const HELD: [f32; 4] = [0.8, -0.7, 0.6, 0.5];
     let (link, bundle) = (own_link(), absolute());
-    let peer = link.peer();
+    let peer = link.peer_of(bundle.path());
     let controller = start_controller_with(bundle.path(), &link, |_| {});
     let mut refused = executed(0, [0.0; 4]);
     refused.reward = f32::NAN;

@@ -77,6 +77,7 @@ fn an_observation_that_comes_after_it_was_imagined_is_answered_as_if_it_had_been
         settings.ticks = TickLimits { imagined_ticks_max: 1000, fallback_ticks_max: 1000 };
     });
     let mut policy = Policy::load(&smallest_bundle(), EngineSettings::tract()).unwrap();
+    rcwm_testkit::meet(&peer);
     for sequence in 0..6 {
         if sequence == 3 {
             next(&peer, "imagined 3", |action| action.answers == 3 && is(ActionSource::Imagined)(action));
@@ -211,6 +212,7 @@ fn a_peer_that_says_where_it_stands_before_a_stand_in_is_sent_is_gone_back_to_as
     let stop = Arc::<AtomicBool>::default();
     let link = ControllerLink::open(own.0.clone(), |_| Vec::new()).unwrap();
     let (peer, found_nothing) = (own.peer(), Cell::new(false));
+    link.wait_robot(NEVER).unwrap().unwrap();
     peer.publish_copy(&due_now(0)).unwrap();
     let stage = JustInTime { link, peer, times: Cell::new(0), found_nothing, stop: Arc::clone(&stop) };
     let policy = Policy::load(&smallest_bundle(), EngineSettings::tract()).unwrap();

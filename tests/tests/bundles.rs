@@ -108,8 +108,8 @@ fn a_link_in_place_of_a_part_is_read_and_one_to_no_file_is_refused() {
 
 #[test]
 fn another_format_and_an_unknown_key_are_refused() {
-    let folder = changed(|folder| edit_manifest(folder, |text| text.replacen("format = 1", "format = 2", 1)));
-    assert_refused(folder.path(), &["format 2"]);
+    let folder = changed(|folder| edit_manifest(folder, |text| text.replacen("format = 2", "format = 3", 1)));
+    assert_refused(folder.path(), &["format 3"]);
     let folder = changed(|folder| edit_manifest(folder, |text| format!("surprise = 1\n{text}")));
     assert_refused(folder.path(), &["surprise"]);
 }

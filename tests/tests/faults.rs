@@ -117,7 +117,7 @@ fn a_peer_of_another_version_is_refused_with_one_clear_line() {
     let refused = output(runtime(&domain));
     let line = String::from_utf8_lossy(&refused.stderr);
     assert!(!refused.status.success());
-    assert!(line.contains("another version") && line.contains("rcwm.Observation.v1"), "{line}");
+    assert!(line.contains("another version") && line.contains("rcwm.Observation.v2"), "{line}");
     let mut command = domain.command("rcwm-simulator");
     command.args(["serve", "--task", "reach", "--instance", "fault", "--episodes", "1"]);
     let refused = output(command);

@@ -222,7 +222,8 @@ impl OwnedObservation {
     }
 
     fn take_header(&mut self, from: &Observation<'_>) {
-        if !Arc::ptr_eq(&self.format, from.format) {
+        let same = Arc::ptr_eq(&self.format, from.format) || self.format.hash() == from.format.hash();
+        if !same {
             *self = Self::zeroed(from.format);
         }
         self.header = *from.header;

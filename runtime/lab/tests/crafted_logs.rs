@@ -123,13 +123,18 @@ fn use_log(path: &Path) -> Result<ReplayReport, ReplayError> {
     Ok(report)
 }
 
+fn interface() -> Record {
+    Record::Interface(Format::metaworld().interface().canonical())
+}
+
 fn of_records(change: impl FnOnce(&mut Header, &mut Vec<TickRecord>)) -> Result<ReplayReport, ReplayError> {
     let bundle = Bundle::open(&bundle()).unwrap();
     let mut header = header(&bundle);
     let mut images = ImagePacker::default();
     let mut ticks = (0..4).map(|step| tick(&mut images, step, None)).collect();
     change(&mut header, &mut ticks);
-    let records: Vec<_> = ticks.into_iter().map(|tick| Record::Tick(Box::new(tick))).collect();
+    let records = ticks.into_iter().map(|tick| Record::Tick(Box::new(tick)));
+    let records: Vec<_> = std::iter::once(interface()).chain(records).collect();
     let folder = tempfile::tempdir().unwrap();
     let path = folder.path().join("crafted.rcwmlog");
     write(&path, &payloads(&header, &records));
@@ -233,8 +238,9 @@ fn bytes_changed_at_random_behind_checksums_that_fit_make_no_tool_panic() {
     let mut images = ImagePacker::default();
     let loaded = Policy::load(&self::bundle(), EngineSettings::tract()).unwrap();
     let whole = |step| (step % 2 == 0).then(|| WholeState::of(loaded.state(), 7));
-    let mut records: Vec<_> =
-        (0..4).map(|step| Record::Tick(Box::new(tick(&mut images, step, whole(step))))).collect();
+    let mut records: Vec<_> = std::iter::once(interface())
+        .chain((0..4).map(|step| Record::Tick(Box::new(tick(&mut images, step, whole(step))))))
+        .collect();
     records.insert(2, Record::Policy(BundleIdentity::of(&bundle.manifest)));
     records.push(Record::End { ticks: 4, dropped: 0 });
     let sound = payloads(&header(&bundle), &records);

@@ -153,6 +153,12 @@ impl OwnLink {
         SimulatorLink::open(self.0.clone(), &Format::metaworld()).unwrap()
     }
 
+    /// The same, of a robot that fits a bundle.
+    pub fn peer_of(&self, bundle: &Path) -> SimulatorLink {
+        let manifest = Bundle::open(bundle).unwrap().manifest;
+        SimulatorLink::open(self.0.clone(), &Format::of(manifest.interface)).unwrap()
+    }
+
     pub fn prefix(&self) -> &str {
         self.0.prefix.as_deref().unwrap()
     }
@@ -286,6 +292,14 @@ pub fn image(step: u32) -> [u8; IMAGE_BYTES] {
     std::array::from_fn(|i| {
         ((i as u32).wrapping_mul(2_654_435_761).wrapping_add(step.wrapping_mul(977)) >> 13) as u8
     })
+}
+
+/// Waits until a controller has found the robot: what is published from here on reaches it.
+pub fn meet(peer: &SimulatorLink) {
+    let start = std::time::Instant::now();
+    while !peer.wait_action(Duration::from_millis(20)).unwrap().1.hello {
+        assert!(start.elapsed() < NEVER, "no controller came");
+    }
 }
 
 /// Publishes an observation and waits for the action that answers it.

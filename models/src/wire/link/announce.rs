@@ -50,6 +50,10 @@ impl Inquirer {
         Ok(inquirer)
     }
 
+    pub(super) fn instance(&self) -> &str {
+        &self.instance
+    }
+
     /// Asks the robot, if it is there, to say its interface again.
     pub(super) fn ask(&self) -> Result<(), LinkError> {
         self.robot.notify(EVENT_ASKED)

@@ -79,7 +79,7 @@ impl ControllerLink {
         if let Some(robot) = self.robot.get() {
             return Ok(Some(robot));
         }
-        let Some(interface) = await_robot(&self.inquirer, timeout)? else { return Ok(None) };
+        let Some(interface) = await_robot(&self.node, &self.inquirer, timeout)? else { return Ok(None) };
         let mismatches = (self.needs)(&interface);
         if !mismatches.is_empty() {
             let (instance, robot) = (self.settings.instance.clone(), interface.name);

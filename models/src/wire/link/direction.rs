@@ -115,6 +115,29 @@ impl<H: Header> Direction<H> {
         Ok(Self { name, data, event })
     }
 
+    /// Whether a service of this name, if there is one, is of these messages: one of another version is an error.
+    pub(super) fn check_version(node: &Node<Ipc>, instance: &str, topic: &str) -> Result<(), LinkError> {
+        use iceoryx2::service::builder::publish_subscribe::PublishSubscribeOpenError::IncompatibleTypes;
+        let (service, name) = service_name(instance, topic)?;
+        let opened = node
+            .service_builder(&name)
+            .publish_subscribe::<[u8]>()
+            .user_header::<H>()
+            .payload_alignment(PAYLOAD_ALIGNMENT)
+            .open();
+        match opened {
+            Err(IncompatibleTypes) => Err(Self::other_version(service)),
+            // What else is wrong is said where it is to be used.
+            _ => Ok(()),
+        }
+    }
+
+    fn other_version(service: String) -> LinkError {
+        // SAFETY: the name is a constant; the function is marked unsafe because peers trust it.
+        let expected = unsafe { <H as ZeroCopySend>::type_name() };
+        LinkError::OtherVersion { service, expected }
+    }
+
     fn data_error(name: &str, error: PublishSubscribeOpenOrCreateError) -> LinkError {
         use iceoryx2::service::builder::publish_subscribe::PublishSubscribeOpenError::{
             IncompatibleAttributes, IncompatibleTypes,
@@ -122,9 +145,7 @@ impl<H: Header> Direction<H> {
         let service = name.to_owned();
         match error {
             PublishSubscribeOpenOrCreateError::PublishSubscribeOpenError(IncompatibleTypes) => {
-                // SAFETY: the name is a constant; the function is marked unsafe because peers trust it.
-                let expected = unsafe { <H as ZeroCopySend>::type_name() };
-                LinkError::OtherVersion { service, expected }
+                Self::other_version(service)
             }
             PublishSubscribeOpenOrCreateError::PublishSubscribeOpenError(IncompatibleAttributes) => {
                 LinkError::OtherInterface { service }

@@ -17,13 +17,18 @@ use crate::wire::{Action, ActionHeader, ActionValues, Format, ObservationHeader,
 const ASK_EVERY: Duration = Duration::from_millis(250);
 
 /// Asks until the robot has said its interface or the time is up.
-pub(super) fn await_robot(inquirer: &Inquirer, timeout: Duration) -> Result<Option<Interface>, LinkError> {
+pub(super) fn await_robot(
+    node: &Node<Ipc>,
+    inquirer: &Inquirer,
+    timeout: Duration,
+) -> Result<Option<Interface>, LinkError> {
     let start = Instant::now();
     loop {
         let left = timeout.saturating_sub(start.elapsed());
         if let Some(interface) = inquirer.wait(left.min(ASK_EVERY))? {
             return Ok(Some(interface));
         }
+        Direction::<ObservationHeader>::check_version(node, inquirer.instance(), "observation")?;
         if start.elapsed() >= timeout {
             return Ok(None);
         }
@@ -74,7 +79,7 @@ impl<H: super::direction::Header> Listener<H> {
         if let Some(found) = self.found.get() {
             return Ok(Some(found));
         }
-        let Some(interface) = await_robot(&self.inquirer, timeout)? else { return Ok(None) };
+        let Some(interface) = await_robot(&self.node, &self.inquirer, timeout)? else { return Ok(None) };
         let format = Format::of(interface);
         let (instance, interface_hash) = (self.settings.instance.as_str(), Some(format.hash()));
         let topic = Topic { instance, name: self.topic, interface_hash, history: false };

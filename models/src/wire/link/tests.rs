@@ -180,6 +180,8 @@ fn a_peer_of_another_version_is_refused() {
     let _old = Direction::<OldObservation>::open(&node, &topic("observation")).unwrap();
     let error = SimulatorLink::open(settings.clone(), &Format::metaworld()).err().unwrap();
     assert!(error.to_string().contains("rcwm.Observation.v2"), "{error}");
+    let error = ControllerLink::open(settings, anything).err().unwrap();
+    assert!(error.to_string().contains("rcwm.Observation.v2"), "{error}");
 }
 
 #[test]

@@ -73,8 +73,9 @@ pub(crate) fn run(
     let swapper = swaps.then(|| swapper(link, setup, &policy)).transpose()?;
     // The first two make the services as they must be.
     let controller_link = ControllerLink::open(link.clone(), |_| Vec::new())?;
-    drop(SimulatorLink::open(link.clone(), &Format::metaworld())?);
+    let robot = SimulatorLink::open(link.clone(), &Format::metaworld())?;
     controller_link.wait_robot(Duration::from_secs(10))?.context("the controller does not find its robot")?;
+    drop(robot);
     let wire = Wire::join(link)?;
     let choices = bundles.all.iter().map(|choice| (choice.folder.clone(), choice.known())).collect();
     let asking = Asking::new(link.clone(), choices, known);
