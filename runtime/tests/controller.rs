@@ -113,8 +113,8 @@ fn an_observation_that_is_not_finite_is_refused_and_the_last_action_held() {
 #[test]
 fn the_bundle_s_action_limits_hold_for_every_source() {
     let narrow = with_manifest(|manifest| {
-        manifest.control.action_low = [0.25, -0.001, -1.0, -1.0];
-        manifest.control.action_high = [0.5, 0.001, -0.75, -0.9];
+        manifest.control.action_low = vec![0.25, -0.001, -1.0, -1.0];
+        manifest.control.action_high = vec![0.5, 0.001, -0.75, -0.9];
     });
     let link = own_link();
     let peer = link.peer();

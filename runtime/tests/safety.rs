@@ -283,7 +283,7 @@ fn a_bundle_whose_limits_no_wire_can_carry_is_refused() {
 fn limits_are_last_right_after_a_swap_under_a_rate_limit() {
     const NARROW: f32 = 0.2;
     let narrow = with_manifest(|manifest| {
-        (manifest.control.action_low, manifest.control.action_high) = ([-NARROW; 4], [NARROW; 4]);
+        (manifest.control.action_low, manifest.control.action_high) = (vec![-NARROW; 4], vec![NARROW; 4]);
     });
     let link = own_link();
     let peer = link.peer();

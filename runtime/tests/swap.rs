@@ -86,7 +86,7 @@ impl Peer<'_> {
 /// The smallest bundle with other limits, so that its actions tell it from the first; golden values know no limits.
 fn other_bundle() -> tempfile::TempDir {
     with_manifest(|manifest| {
-        (manifest.control.action_low, manifest.control.action_high) = ([0.5; 4], [0.75; 4]);
+        (manifest.control.action_low, manifest.control.action_high) = (vec![0.5; 4], vec![0.75; 4]);
     })
 }
 

@@ -196,6 +196,16 @@ impl Manifest {
                 control.rate_hz
             )));
         }
+        let limits = [("action_low", &control.action_low), ("action_high", &control.action_high)];
+        for (name, limits) in limits {
+            if limits.len() != self.model.action {
+                return Err(BundleError::Invalid(format!(
+                    "control.{name} has {} numbers, the model's action {}",
+                    limits.len(),
+                    self.model.action
+                )));
+            }
+        }
         for (low, high) in control.action_low.iter().zip(&control.action_high) {
             // Written so that NaN fails.
             if !(*low >= -ACTION_MAX && *high <= ACTION_MAX && low < high) {

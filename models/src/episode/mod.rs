@@ -2,13 +2,17 @@
 //!
 //! | key | type | shape | meaning |
 //! | --- | --- | --- | --- |
-//! | `image` | u8 | [T, 64, 64, 3] | upright, RGB |
-//! | `action` | f32 | [T, 4] | the action that LED TO `image[t]`; zeros at the first |
+//! | `image` | u8 | [T, S, S, 3] | upright, RGB; S is 64 or 128 |
+//! | `image_2` to `image_4` (optional) | u8 | [T, S, S, 3] | the same moments through further cameras |
+//! | `action` | f32 | [T, a] | the action that LED TO `image[t]`; zeros at the first |
 //! | `reward` | f32 | [T] | of that transition |
 //! | `is_first`, `is_last`, `is_terminal`, `success` | bool | [T] | |
-//! | `robot_mask` (optional) | u8 | [T, 64, 64, 1] | 1 where the robot is, else 0 |
-//! | `proprio` (optional) | f32 | [T, 18] | joint positions and velocities |
-//! | `disturbed` (optional) | u8 | [T, 64, 64, 3] | the same moments in another look |
+//! | `robot_mask` (optional) | u8 | [T, S, S, 1] | 1 where the robot is, else 0 |
+//! | `proprio` (optional) | f32 | [T, p] | the robot's measured state: joint positions, velocities and the like |
+//! | `disturbed` (optional) | u8 | [T, S, S, 3] | the same moments in another look |
+//!
+//! `robot_mask` and `disturbed` have a `_2` to `_4` of their own, for every further camera or for none. In memory the cameras are side by
+//! side, pixel by pixel: an [`Episode`]'s images have 3 C channels.
 //!
 //! These are written. Read is what numpy reads and others write: numbers of any size and byte order, Fortran order, axes of length 1
 //! more or less (`[T, 1]` for `[T]`), masks as 0 and 255 or as numbers of objects. An action that stands at the image it was
@@ -22,8 +26,8 @@ use std::path::{Path, PathBuf};
 use ndarray::{Array1, Array2, Array3, Array4, Axis, Slice};
 
 use crate::files::{FileError, read_capped, write_atomic, write_new};
+use crate::settings::ModelSettings;
 use crate::wire::{Observation, ObservationFlags};
-use crate::{ACTION_LEN, IMAGE_CHANNELS, IMAGE_SIDE, PROPRIOCEPTION_LEN};
 
 /// Longest episode accepted, in steps.
 pub const STEPS_MAX: usize = 100_000;
@@ -33,9 +37,9 @@ pub const EPISODE_BYTES_MAX: u64 = 1 << 30;
 /// One episode, or the part of one that was seen.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Episode {
-    /// [T, 64, 64, 3].
+    /// [T, S, S, 3 C]: red, green and blue of the first camera, then of the next.
     pub image: Array4<u8>,
-    /// [T, 4]: the action that led to the image of the same step.
+    /// [T, action]: the action that led to the image of the same step.
     pub action: Array2<f32>,
     /// [T].
     pub reward: Array1<f32>,
@@ -49,11 +53,11 @@ pub struct Episode {
     pub success: Array1<bool>,
     /// [T], true where the action was a push off course and no example of what to do.
     pub pushed: Array1<bool>,
-    /// [T, 64, 64], true where the robot is.
+    /// [T, S, S * C], true where the robot is; a pixel's cameras are side by side.
     pub robot_mask: Option<Array3<bool>>,
-    /// [T, 18].
+    /// [T, state]: what the robot measured of itself.
     pub proprio: Option<Array2<f32>>,
-    /// [T, 64, 64, 3]: what `image` shows, in another look.
+    /// [T, S, S, 3 C]: what `image` shows, in another look.
     pub disturbed: Option<Array4<u8>>,
 }
 
@@ -90,14 +94,30 @@ pub enum EpisodeError {
     Order(String),
 }
 
+/// What an episode has in another size than a model needs it.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub struct Misfit {
+    /// The array's name.
+    pub key: &'static str,
+    pub found: String,
+    /// What the model needs.
+    pub expected: String,
+}
+
 impl Episode {
-    /// `steps` black pictures with zero actions and rewards, no masks; the first step is marked as such.
+    /// [`Episode::blank_of`] the paper's robot: one camera of 64 x 64, four numbers.
     #[must_use]
     pub fn blank(steps: usize) -> Self {
+        Self::blank_of(steps, 64, 1, 4)
+    }
+
+    /// `steps` black pictures with zero actions and rewards, no masks; the first step is marked as such.
+    #[must_use]
+    pub fn blank_of(steps: usize, side: usize, cameras: usize, action: usize) -> Self {
         let no = Array1::from_elem(steps, false);
         Self {
-            image: Array4::zeros((steps, IMAGE_SIDE, IMAGE_SIDE, IMAGE_CHANNELS)),
-            action: Array2::zeros((steps, ACTION_LEN)),
+            image: Array4::zeros((steps, side, side, 3 * cameras)),
+            action: Array2::zeros((steps, action)),
             reward: Array1::zeros(steps),
             is_first: (0..steps).map(|step| step == 0).collect(),
             is_last: no.clone(),
@@ -120,6 +140,39 @@ impl Episode {
     #[must_use]
     pub fn is_empty(&self) -> bool {
         self.reward.is_empty()
+    }
+
+    /// `S`: the images' side.
+    #[must_use]
+    pub fn side(&self) -> usize {
+        self.image.len_of(Axis(1))
+    }
+
+    /// What does not fit a model of these sizes, if anything. A state that the model does not look at may be anything.
+    #[must_use]
+    pub fn misfit(&self, model: &ModelSettings) -> Option<Misfit> {
+        let images = |side: usize, channels: usize| {
+            let cameras = channels / 3;
+            format!("{side} x {side} of {cameras} {}", if cameras == 1 { "camera" } else { "cameras" })
+        };
+        let (found, needed) = (
+            images(self.side(), self.image.len_of(Axis(3))),
+            images(model.image_side, model.image_channels()),
+        );
+        if found != needed {
+            return Some(Misfit { key: "image", found, expected: needed });
+        }
+        let numbers = |count: usize| format!("of {count} numbers");
+        let action = self.action.ncols();
+        if action != model.action {
+            return Some(Misfit { key: "action", found: numbers(action), expected: numbers(model.action) });
+        }
+        let state = self.proprio.as_ref().map(Array2::ncols);
+        (model.state > 0 && state != Some(model.state)).then(|| Misfit {
+            key: "proprio",
+            found: state.map_or_else(|| "missing".to_owned(), numbers),
+            expected: numbers(model.state),
+        })
     }
 
     /// Sum of the rewards.
@@ -277,7 +330,10 @@ impl EpisodeBuilder {
         let mut is_first = bits(ObservationFlags::FIRST);
         is_first[0] = true;
         let fits = "pushed in whole steps";
-        let mut action = Array2::from_shape_vec((steps, ACTION_LEN), this.action).expect(fits);
+        let side = (this.image.len() / steps / 3).isqrt();
+        let vectors =
+            |numbers: Vec<f32>| Array2::from_shape_vec((steps, numbers.len() / steps), numbers).expect(fits);
+        let mut action = vectors(this.action);
         // No action led to the first step of what was seen, also where it was joined in its middle.
         action.row_mut(0).fill(0.0);
         Some(Episode {
@@ -286,14 +342,12 @@ impl EpisodeBuilder {
             success: bits(ObservationFlags::SUCCESS),
             pushed: bits(ObservationFlags::PUSHED),
             is_first,
-            image: Array4::from_shape_vec((steps, IMAGE_SIDE, IMAGE_SIDE, IMAGE_CHANNELS), this.image)
-                .expect(fits),
+            image: Array4::from_shape_vec((steps, side, side, 3), this.image).expect(fits),
             action,
             reward: this.reward.into(),
-            robot_mask: (this.masks == steps).then(|| {
-                Array3::from_shape_vec((steps, IMAGE_SIDE, IMAGE_SIDE), this.robot_mask).expect(fits)
-            }),
-            proprio: Some(Array2::from_shape_vec((steps, PROPRIOCEPTION_LEN), this.proprio).expect(fits)),
+            robot_mask: (this.masks == steps)
+                .then(|| Array3::from_shape_vec((steps, side, side), this.robot_mask).expect(fits)),
+            proprio: Some(vectors(this.proprio)),
             disturbed: None,
         })
     }

@@ -273,7 +273,7 @@ fn a_log_replays_with_its_own_bundle_only() {
     let folder = tempfile::tempdir().unwrap();
     let file = folder.path().join("run.rcwmlog");
     logged_run(&smallest_bundle(), &file, Sampling::Mode, 3);
-    let narrow = with_manifest(|manifest| manifest.control.action_low = [-0.5; 4]);
+    let narrow = with_manifest(|manifest| manifest.control.action_low = vec![-0.5; 4]);
     let mut command = Command::cargo_bin("rcwm-lab").unwrap();
     command.args(["replay", "--log"]).arg(&file).arg("--bundle").arg(narrow.path());
     let output = command.assert().code(1).get_output().clone();

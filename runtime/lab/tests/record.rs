@@ -34,7 +34,7 @@ fn a_run_that_records_takes_swaps_and_is_filmed_with_both_policies() {
     let peer = link.peer();
     let run = run(&link).arg("--record").arg(folder.path()).args(["--record-episodes", "2"]).spawn().unwrap();
     episode(&peer, 0);
-    let other = with_manifest(|manifest| manifest.control.action_low = [-0.5; 4]);
+    let other = with_manifest(|manifest| manifest.control.action_low = vec![-0.5; 4]);
     let never = AtomicBool::new(false);
     let answer =
         ask(&link.0, other.path(), When::Now, Some(Duration::from_secs(60)), &never, &mut |_| ()).unwrap();

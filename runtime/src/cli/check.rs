@@ -53,7 +53,7 @@ pub(super) fn run(arguments: &CheckArguments) -> anyhow::Result<()> {
     shared::prepare_json(arguments.json.as_deref())?;
     let robot = read(&arguments.robot)?;
     let bundle = arguments.bundle.as_deref().map(shared::open_bundle).transpose()?;
-    let mismatches = bundle.as_ref().map(|bundle| bundle.manifest.control.mismatches(&robot));
+    let mismatches = bundle.as_ref().map(|bundle| bundle.manifest.mismatches(&robot));
     let layout = Layout::of(&robot);
     let report = Report {
         robot: &arguments.robot,

@@ -161,7 +161,7 @@ mod tests {
     const HIGH: [f32; ACTION_LEN] = [1.0, 0.5, 1.0, 1.0];
 
     fn control(mode: ActionMode) -> Control {
-        Control { rate_hz: 40.0, action_low: LOW, action_high: HIGH, action_mode: mode }
+        Control { rate_hz: 40.0, action_low: LOW.to_vec(), action_high: HIGH.to_vec(), action_mode: mode }
     }
 
     fn safety_filter(rate_max: Option<f32>) -> SafetyFilter {
@@ -286,7 +286,8 @@ mod tests {
     fn limits_come_last_even_where_another_policy_has_narrower_ones_than_what_was_sent() {
         let mut filter = safety_filter(Some(0.1));
         filter.sent([0.9, 0.5, 0.9, -0.9]);
-        let control = Control { action_low: [-0.2; 4], action_high: [0.2; 4], ..control(ActionMode::Delta) };
+        let control =
+            Control { action_low: vec![-0.2; 4], action_high: vec![0.2; 4], ..control(ActionMode::Delta) };
         filter.take_limits(&control);
         assert_eq!(filter.pass([1.0, 1.0, 1.0, -1.0]).unwrap().action, [0.2, 0.2, 0.2, -0.2]);
         assert_eq!(filter.pass([f32::NAN; 4]).unwrap().action, [0.2, 0.2, 0.2, -0.2]);

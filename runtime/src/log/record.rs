@@ -100,7 +100,8 @@ impl BundleIdentity {
             task: manifest.task.clone(),
             preset: manifest.provenance.preset.clone(),
             sha256: std::iter::once(initial).chain(parts).collect(),
-            action_limits: [manifest.control.action_low, manifest.control.action_high],
+            action_limits: [&manifest.control.action_low, &manifest.control.action_high]
+                .map(|limits| std::array::from_fn(|i| limits.get(i).copied().unwrap_or_default())),
         }
     }
 

@@ -16,7 +16,8 @@ impl ActionLimits {
     /// The limits of a bundle, whose loading has checked that they are finite and low < high.
     #[must_use]
     pub fn of(control: &Control) -> Self {
-        Self { low: control.action_low, high: control.action_high }
+        let fixed = |limits: &[f32]| std::array::from_fn(|i| limits.get(i).copied().unwrap_or_default());
+        Self { low: fixed(&control.action_low), high: fixed(&control.action_high) }
     }
 
     /// The nearest action within the limits. A component that is no number stays none: no action is nearest to it.

@@ -5,7 +5,6 @@ use std::io;
 use std::path::{Path, PathBuf};
 
 use ndarray::{ArrayD, IxDyn};
-use rcwm_models::ACTION_LEN;
 use rcwm_models::bundle::{
     ActionMode, Bundle, Control, FORMAT, FileEntry, InitialState, MANIFEST_FILE, Manifest, PartEntry,
     PartName, Provenance,
@@ -62,8 +61,8 @@ pub fn write(
     let World::Rcwm(_) = agent.world else { return Err(ExportError::Vanilla) };
     let replaces = check_place(place, options.replace)?;
     let scene = match &options.golden_episode {
-        Some(path) => Scene::from_episode(path, options.golden_ticks)?,
-        None => Scene::synthetic(options.golden_ticks)?,
+        Some(path) => Scene::from_episode(path, options.golden_ticks, settings)?,
+        None => Scene::synthetic(options.golden_ticks, settings)?,
     };
 
     let parent = parent_of(place);
@@ -93,8 +92,8 @@ pub fn write(
         model: settings.clone(),
         control: Control {
             rate_hz: options.rate_hz,
-            action_low: [-1.0; ACTION_LEN],
-            action_high: [1.0; ACTION_LEN],
+            action_low: vec![-1.0; settings.action],
+            action_high: vec![1.0; settings.action],
             action_mode: ActionMode::default(),
         },
         provenance: provenance(checkpoint, options, &scene),

@@ -68,7 +68,8 @@ impl Bundles {
         for (name, limits, is_absolute) in limits {
             let folder = changed(source, |manifest, _| {
                 if let Some((low, high)) = limits {
-                    (manifest.control.action_low, manifest.control.action_high) = (low, high);
+                    (manifest.control.action_low, manifest.control.action_high) =
+                        (low.to_vec(), high.to_vec());
                 }
                 if is_absolute {
                     manifest.control.action_mode = ActionMode::Absolute;
