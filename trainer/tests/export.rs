@@ -177,7 +177,10 @@ fn exported_graphs_of_two_large_cameras_and_a_measured_state_give_the_models_num
 
     let root = Path::new(env!("CARGO_MANIFEST_DIR")).join("..");
     let mut check = Command::new(root.join(".venv/bin/python"));
-    check.arg(root.join("tests/python/check_bundle.py")).arg(&place).assert().success();
+    check.arg(root.join("tests/python/check_bundle.py")).arg(&place);
+    let said = check.assert().success();
+    let said = String::from_utf8_lossy(&said.get_output().stdout).into_owned();
+    assert!(said.contains("all parts within 1e-05 over 6 ticks"), "{said}");
 }
 
 #[test]

@@ -216,4 +216,14 @@ fn the_commands_take_the_sizes_and_refuse_what_they_do_not_have() {
     run(&[&pretrain[..], &sizes, &updates].concat()).success();
     let metrics = std::fs::read_to_string(folder.path().join("run/metrics.jsonl")).unwrap();
     assert!(metrics.lines().all(|line| line.contains("\"state_loss\":")), "{metrics}");
+
+    let evaluate =
+        ["evaluate", "--data", "data", "--windows", "anywhere", "--context", "4", "--imagined", "6"];
+    let of = |checkpoint| [&evaluate[..], &["--checkpoint", checkpoint, "--out", "shown"]].concat();
+    run(&of("run/checkpoints/last")).success();
+    assert!(folder.path().join("shown/robot_error.png").is_file());
+    run(&["init", "--preset", "debug", "--out", "small"]).success();
+    let refused = run(&of("small")).failure();
+    let text = String::from_utf8(refused.get_output().stderr.clone()).unwrap();
+    assert!(text.contains("0.npz") && text.contains("expected 64 x 64 of 1 camera"), "{text}");
 }

@@ -16,7 +16,7 @@ pub(super) fn pixels_of(images: &Tensor) -> Result<usize> {
 #[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord, Serialize, Deserialize)]
 #[serde(rename_all = "snake_case")]
 pub enum Measure {
-    /// Squared error of the picture times the true robot mask, mean over the whole picture's 64 * 64 * 3 values: the robot dynamics
+    /// Squared error of the picture times the true robot mask, mean over the whole picture's values: the robot dynamics
     /// error (paper, 5.2 and Fig. 4). Values of a picture lie in [0, 1].
     RobotError,
     /// The same, mean over the robot's pixels only: does not grow with the robot's size in the picture.
@@ -67,7 +67,7 @@ impl Measure {
     pub const fn definition(self) -> &'static str {
         match self {
             Self::RobotError => {
-                "sum over pixels and channels of (imagined - true)^2 * true robot mask, divided by 64*64*3; pictures in [0, 1], whole \
+                "sum over pixels and channels of (imagined - true)^2 * true robot mask, divided by the picture's number of values; pictures in [0, 1], whole \
                  picture of the model, not clipped"
             }
             Self::RobotErrorOnRobot => {
@@ -77,7 +77,7 @@ impl Measure {
                 "intersection over union of the robot branch's mask above 0.5 and the true mask; steps where both are empty left out"
             }
             Self::ReconstructionError => {
-                "mean over 64*64*3 values of (imagined - true)^2; pictures in [0, 1], not clipped"
+                "mean over the picture's values of (imagined - true)^2; pictures in [0, 1], not clipped"
             }
             Self::RewardError => "absolute difference of the expected reward and the recorded one",
             Self::MovingError => {
