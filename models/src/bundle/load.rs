@@ -200,7 +200,7 @@ impl Manifest {
         for (name, limits) in limits {
             if limits.len() != self.model.action {
                 return Err(BundleError::Invalid(format!(
-                    "control.{name} has {} numbers, the model's action {}",
+                    "control.{name} has {} numbers, model.action = {}",
                     limits.len(),
                     self.model.action
                 )));
