@@ -1,10 +1,10 @@
 //! The sizes of a model: presets, TOML, and dotted overrides (`--set model.cnn_depth=16`).
 
-use std::path::Path;
+mod overrides;
 
-use serde::{Deserialize, Serialize, de::DeserializeOwned};
+use serde::{Deserialize, Serialize};
 
-use crate::ACTION_LEN;
+pub use overrides::{read, with_overrides};
 
 /// Which world model.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
@@ -48,10 +48,52 @@ pub struct ModelSettings {
     pub units: usize,
     /// Bins of the two-hot reward and value distributions, over symlog [-20, 20].
     pub bins: usize,
-    /// Length of an action.
+    /// Numbers of an action.
     pub action: usize,
     /// Share of the uniform distribution mixed into the class probabilities.
     pub unimix: f64,
+    /// `S`: side of the square images, in pixels.
+    #[serde(default = "default_image_side", skip_serializing_if = "is_default_image_side")]
+    pub image_side: usize,
+    /// `C`: cameras whose images the encoder sees side by side on its channels.
+    #[serde(default = "default_cameras", skip_serializing_if = "is_default_cameras")]
+    pub cameras: usize,
+    /// Numbers of the robot's measured state (proprioception); 0: it is not looked at.
+    #[serde(default, skip_serializing_if = "is_zero")]
+    pub state: usize,
+}
+
+/// Sides of images that there are stages of convolutions for.
+pub const IMAGE_SIDES: [usize; 2] = [64, 128];
+/// Most cameras of a model.
+pub const CAMERAS_MAX: usize = 4;
+/// Most numbers of an action.
+pub const ACTION_NUMBERS_MAX: usize = 64;
+/// Most numbers of a measured state.
+pub const STATE_NUMBERS_MAX: usize = 1024;
+
+// What is left out of the text where it is the default, so that files of models without it stay as they were.
+fn default_image_side() -> usize {
+    64
+}
+
+fn default_cameras() -> usize {
+    1
+}
+
+#[allow(clippy::trivially_copy_pass_by_ref, reason = "serde asks with a reference")]
+fn is_default_image_side(side: &usize) -> bool {
+    *side == default_image_side()
+}
+
+#[allow(clippy::trivially_copy_pass_by_ref, reason = "serde asks with a reference")]
+fn is_default_cameras(cameras: &usize) -> bool {
+    *cameras == default_cameras()
+}
+
+#[allow(clippy::trivially_copy_pass_by_ref, reason = "serde asks with a reference")]
+fn is_zero(state: &usize) -> bool {
+    *state == 0
 }
 
 impl ModelSettings {
@@ -76,8 +118,12 @@ impl ModelSettings {
             hidden: width,
             units,
             bins: 255,
-            action: ACTION_LEN,
+            // The paper's robot: three translations of the hand and the gripper.
+            action: 4,
             unimix: 0.01,
+            image_side: default_image_side(),
+            cameras: default_cameras(),
+            state: 0,
         }
     }
 
@@ -100,6 +146,24 @@ impl ModelSettings {
             ModelKind::Rcwm => 2 * self.branch_width(),
             ModelKind::Vanilla => self.branch_width(),
         }
+    }
+
+    /// `3 C`: channels of an image, all cameras.
+    #[must_use]
+    pub fn image_channels(&self) -> usize {
+        3 * self.cameras
+    }
+
+    /// Convolutions that halve an image's sides until 4 x 4 are left: 4 for 64, 5 for 128.
+    #[must_use]
+    pub fn stages(&self) -> usize {
+        (self.image_side / 4).ilog2() as usize
+    }
+
+    /// Side of the features that the branches share, `S / 4`: two convolutions made them.
+    #[must_use]
+    pub fn feature_side(&self) -> usize {
+        self.image_side / 4
     }
 
     /// `k = d / m`: rows the interaction model makes of the robot's h (A.2).
@@ -126,9 +190,20 @@ impl ModelSettings {
         in_range("hidden", self.hidden, 8192)?;
         in_range("units", self.units, 8192)?;
         in_range("bins", self.bins, 4096)?;
-        if self.action != ACTION_LEN {
-            let found = self.action;
-            return Err(SettingsError::Invalid(format!("action = {found}, the wire carries {ACTION_LEN}")));
+        in_range("action", self.action, ACTION_NUMBERS_MAX)?;
+        in_range("cameras", self.cameras, CAMERAS_MAX)?;
+        if !IMAGE_SIDES.contains(&self.image_side) {
+            let [small, large] = IMAGE_SIDES;
+            return Err(SettingsError::Invalid(format!(
+                "image_side = {}, expected {small} or {large}",
+                self.image_side
+            )));
+        }
+        if self.state > STATE_NUMBERS_MAX {
+            return Err(SettingsError::Invalid(format!(
+                "state = {}, expected 0 (none) to {STATE_NUMBERS_MAX}",
+                self.state
+            )));
         }
         if self.bins.is_multiple_of(2) {
             let found = self.bins;
@@ -180,82 +255,6 @@ pub enum SettingsError {
     File(#[from] crate::files::FileError),
 }
 
-/// Largest settings file accepted.
-const SETTINGS_BYTES_MAX: u64 = 1 << 20;
-
-/// Reads settings from a TOML file; unknown keys are refused.
-pub fn read<T: DeserializeOwned>(path: &Path) -> Result<T, SettingsError> {
-    let bytes = crate::files::read_capped(path, SETTINGS_BYTES_MAX)?;
-    let text = String::from_utf8(bytes)
-        .map_err(|_| SettingsError::Invalid(format!("{} is not UTF-8", path.display())))?;
-    Ok(toml::from_str(&text)?)
-}
-
-/// Applies dotted overrides (`model.cnn_depth=16`) to settings. A key must exist already; the value is read as
-/// TOML, and as a plain string where it is no TOML value (`task=reach`).
-///
-/// # Errors
-/// [`SettingsError::OverrideForm`], [`SettingsError::UnknownKey`], or [`SettingsError::Toml`] for a wrong type.
-pub fn with_overrides<T: Serialize + DeserializeOwned>(
-    settings: &T,
-    overrides: &[String],
-) -> Result<T, SettingsError> {
-    let mut root = toml::Table::try_from(settings)?;
-    for text in overrides {
-        let (key, value) = text.split_once('=').ok_or_else(|| SettingsError::OverrideForm(text.clone()))?;
-        let key = key.trim();
-        match slot_of(&mut root, key) {
-            Some(slot) => *slot = parse_value(value.trim(), slot),
-            None => {
-                return Err(SettingsError::UnknownKey { key: key.to_owned(), near: nearest_key(&root, key) });
-            }
-        }
-    }
-    Ok(root.try_into()?)
-}
-
-fn slot_of<'a>(root: &'a mut toml::Table, key: &str) -> Option<&'a mut toml::Value> {
-    match key.split_once('.') {
-        None => root.get_mut(key),
-        Some((first, rest)) => slot_of(root.get_mut(first)?.as_table_mut()?, rest),
-    }
-}
-
-fn parse_value(text: &str, old: &toml::Value) -> toml::Value {
-    let parsed =
-        toml::from_str::<toml::Table>(&format!("value = {text}")).ok().and_then(|mut t| t.remove("value"));
-    match (parsed, old) {
-        // `lr=1` is meant as 1.0 where the setting is a float.
-        (Some(toml::Value::Integer(integer)), toml::Value::Float(_)) => toml::Value::Float(integer as f64),
-        (Some(value), _) => value,
-        (None, _) => toml::Value::String(text.to_owned()),
-    }
-}
-
-fn nearest_key(root: &toml::Table, key: &str) -> Option<String> {
-    let mut keys = Vec::new();
-    collect_keys(root, "", &mut keys);
-    // A bare name finds its dotted home (`cnn_depth` -> `model.cnn_depth`).
-    let last = |dotted: &str| dotted.rsplit('.').next().unwrap_or(dotted).to_owned();
-    if let Some(exact) = keys.iter().find(|candidate| last(candidate) == last(key)) {
-        return Some(exact.clone());
-    }
-    let score = |candidate: &String| {
-        strsim::jaro_winkler(candidate, key).max(strsim::jaro_winkler(&last(candidate), &last(key)))
-    };
-    keys.into_iter().filter(|candidate| score(candidate) > 0.8).max_by(|a, b| score(a).total_cmp(&score(b)))
-}
-
-fn collect_keys(table: &toml::Table, prefix: &str, keys: &mut Vec<String>) {
-    for (name, value) in table {
-        let dotted = if prefix.is_empty() { name.clone() } else { format!("{prefix}.{name}") };
-        match value {
-            toml::Value::Table(inner) => collect_keys(inner, &dotted, keys),
-            _ => keys.push(dotted),
-        }
-    }
-}
-
 #[cfg(test)]
 mod tests {
     use super::*;
@@ -294,6 +293,37 @@ mod tests {
         let error = with_overrides(&settings, &["cnn_dept=1".into()]).unwrap_err().to_string();
         assert!(error.contains("did you mean cnn_depth?"), "{error}");
         assert!(matches!(with_overrides(&settings, &["units".into()]), Err(SettingsError::OverrideForm(_))));
+    }
+
+    #[test]
+    fn sizes_that_are_the_default_are_not_written_and_can_be_set() {
+        let settings = ModelSettings::preset(Preset::Debug, ModelKind::Rcwm);
+        let text = toml::to_string(&settings).unwrap();
+        assert!(!["image_side", "cameras", "state"].iter().any(|key| text.contains(key)), "{text}");
+        let sizes = ["image_side=128", "cameras=2", "state=14", "action=7"].map(str::to_owned);
+        let other = with_overrides(&settings, &sizes).unwrap();
+        assert_eq!((other.image_side, other.cameras, other.state, other.action), (128, 2, 14, 7));
+        assert_eq!((other.stages(), other.feature_side(), other.image_channels()), (5, 32, 6));
+        other.validate().unwrap();
+        assert_eq!(toml::from_str::<ModelSettings>(&toml::to_string(&other).unwrap()).unwrap(), other);
+        assert_eq!(with_overrides(&other, &["cameras=1".into(), "state=0".into()]).unwrap().cameras, 1);
+        let error = with_overrides(&settings, &["camera=2".into()]).unwrap_err().to_string();
+        assert!(error.contains("did you mean cameras?"), "{error}");
+    }
+
+    #[test]
+    fn sizes_out_of_range_are_refused_with_what_is_accepted() {
+        let settings = ModelSettings::preset(Preset::Debug, ModelKind::Rcwm);
+        for (change, expected) in [
+            ("action=0", "action = 0, expected 1 to 64"),
+            ("action=65", "action = 65, expected 1 to 64"),
+            ("image_side=96", "image_side = 96, expected 64 or 128"),
+            ("cameras=5", "cameras = 5, expected 1 to 4"),
+            ("state=1025", "state = 1025, expected 0 (none) to 1024"),
+        ] {
+            let found = with_overrides(&settings, &[change.to_owned()]).unwrap();
+            assert_eq!(found.validate().unwrap_err().to_string(), format!("settings: {expected}"));
+        }
     }
 
     #[test]

@@ -111,7 +111,8 @@ def replay(policy, golden, initial, errors, recurrent):
         features = encoder["features"]
         errors.compare("encoder", tick, encoder)
         action, noise = golden["input/action"][row], golden["input/robot_noise"][tick]
-        robot = policy.run("robot", robot_z, robot_h, action, features, noise)
+        measured = [golden["input/state"][row]] if "input/state" in golden else []
+        robot = policy.run("robot", robot_z, robot_h, action, features, noise, *measured)
         errors.compare("robot", tick, robot)
         if not recurrent:
             robot = expected(golden, "robot", tick)

@@ -14,7 +14,7 @@ use rcwm_models::bundle::{Bundle, MANIFEST_FILE, PartName};
 use rcwm_models::episode::Episode;
 use rcwm_models::interface::Interface;
 use rcwm_models::onnx;
-use rcwm_models::settings::ModelKind;
+use rcwm_models::settings::{ModelKind, ModelSettings, Preset};
 use rcwm_models::tensors::Values;
 use rcwm_trainer::checkpoint::Checkpoint;
 use rcwm_trainer::export::{self, ExportError, Options, Progress};
@@ -157,6 +157,37 @@ fn an_interrupted_export_leaves_the_old_bundle_and_nothing_else() {
         assert_eq!(Bundle::open(&place).unwrap().manifest, old.manifest);
         assert_eq!(entries(folder.path()), 1);
     }
+}
+
+/// Seven joints, two cameras of 128 x 128.
+fn two_cameras() -> Interface {
+    Interface::parse(include_str!("data/two-cameras.toml")).unwrap()
+}
+
+/// ONNX Runtime and the official checker, which share no code with this project, on every part and on the recurrent policy.
+#[test]
+fn exported_graphs_of_two_large_cameras_and_a_measured_state_give_the_models_numbers() {
+    let folder = tempfile::tempdir().unwrap();
+    let place = folder.path().join("bundle");
+    let debug = ModelSettings::preset(Preset::Debug, ModelKind::Rcwm);
+    let model = ModelSettings { action: 7, image_side: 128, cameras: 2, state: 14, ..debug };
+    let checkpoint = support::checkpoint(support::lively_parameters(&model), model.clone());
+    let options = Options { interface: two_cameras(), ..options() };
+    let bundle = export(&checkpoint, &place, &options).unwrap();
+    let shape = |input: &str| bundle.golden.get(input).unwrap().shape().to_vec();
+    assert_eq!(shape("input/image"), [6, 128, 128, 6]);
+    assert_eq!((shape("input/action"), shape("input/state")), (vec![6, 7], vec![6, 14]));
+    assert_eq!(shape("expect/decoder/robot_mask")[1..], [128, 128, 2]);
+    let (inputs, _) = PartName::Robot.signature(&model);
+    assert_eq!((inputs[5].name.as_str(), inputs[5].shape.as_slice()), ("state", &[1, 14][..]));
+    assert_eq!(bundle.manifest.policy.inputs, ["front", "wrist", "joint_pos", "joint_vel"]);
+
+    let root = Path::new(env!("CARGO_MANIFEST_DIR")).join("..");
+    let mut check = Command::new(root.join(".venv/bin/python"));
+    check.arg(root.join("tests/python/check_bundle.py")).arg(&place);
+    let said = check.assert().success();
+    let said = String::from_utf8_lossy(&said.get_output().stdout).into_owned();
+    assert!(said.contains("all parts within 1e-05 over 6 ticks"), "{said}");
 }
 
 #[test]

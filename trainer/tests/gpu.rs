@@ -38,6 +38,7 @@ fn batch(rows: usize, length: usize, masks: bool, number: u64) -> HostBatch {
     let mut terminal = vec![false; steps];
     terminal[1] = true;
     HostBatch {
+        side: 64,
         rows,
         length,
         image,
@@ -250,11 +251,19 @@ fn validation_is_of_the_average_that_a_checkpoint_holds() {
 
 #[test]
 fn sizes_that_kernels_do_not_take_are_refused_by_name() {
-    let model = ModelSettings { cnn_depth: 6, ..ModelSettings::preset(Preset::Debug, ModelKind::Rcwm) };
-    let weights = agent::initialise(&model, 1, &Device::Cpu).unwrap();
-    let world = WorldSettings::default();
-    let refused = GpuLearner::new(&Share::alone(Machine::host()), &plan(&model, &world, None), &weights);
-    assert!(refused.unwrap_err().to_string().contains("cnn_depth = 6"));
+    let debug = ModelSettings::preset(Preset::Debug, ModelKind::Rcwm);
+    for (model, name) in [
+        (ModelSettings { cnn_depth: 6, ..debug.clone() }, "cnn_depth = 6"),
+        (ModelSettings { image_side: 128, ..debug.clone() }, "image_side = 128"),
+        (ModelSettings { cameras: 2, ..debug.clone() }, "cameras = 2"),
+        (ModelSettings { state: 14, ..debug }, "state = 14"),
+    ] {
+        let weights = agent::initialise(&model, 1, &Device::Cpu).unwrap();
+        let world = WorldSettings::default();
+        let refused = GpuLearner::new(&Share::alone(Machine::host()), &plan(&model, &world, None), &weights);
+        let text = refused.unwrap_err().to_string();
+        assert!(text.contains(name) && text.lines().count() == 1, "{text}");
+    }
 }
 
 #[test]

@@ -51,7 +51,7 @@ fn compare(format: Format, name: &str) {
     let agent = Agent::new(&parameters.frozen(), &settings).unwrap();
     let actions = Tensor::from_vec(values("actions"), (1, STEPS, 4), &Device::Cpu).unwrap();
     let first = FirstSteps::new((0..STEPS).map(|t| t == 0 || t == 30).collect(), STEPS);
-    let embeds = agent.world.encode(&pictures()).unwrap();
+    let embeds = agent.world.encode(&pictures(), None).unwrap();
     let posteriors = agent.world.observe(&embeds, &actions, &first, &mut Sampler::Mode).unwrap().posteriors;
     let features = posteriors.features().unwrap();
     let mut found = vec![

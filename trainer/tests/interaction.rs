@@ -89,7 +89,7 @@ fn received(model: &ModelSettings, parameters: &Parameters, replay: &Replay) -> 
         .collect();
     let batch = host.into_tensors(&Device::Cpu).unwrap();
     let agent = Agent::new(&parameters.frozen(), model).unwrap();
-    let embeds = agent.world.encode(&batch.image).unwrap();
+    let embeds = agent.world.encode(&batch.image, None).unwrap();
     let observed =
         agent.world.observe(&embeds, &batch.action, &batch.first, &mut Sampler::seeded(3)).unwrap();
     let at = |x: &Tensor, earlier: u32| {

@@ -50,6 +50,7 @@ fn batch(rows: usize, length: usize, masks: bool) -> Batch {
     first[0] = true;
     first[steps - 1] = true;
     let host = HostBatch {
+        side: 64,
         rows,
         length,
         image,

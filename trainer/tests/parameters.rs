@@ -84,7 +84,7 @@ fn everything(scope: &Scope<'_>, settings: &ModelSettings) -> Tensor {
     let actions = Tensor::full(0.3f32, (batch, length, 4), device).unwrap();
     let first = FirstSteps::new(vec![true, false, false, true, false, true], length);
     let mut sampler = Sampler::seeded(7);
-    let embeds = agent.world.encode(&images).unwrap();
+    let embeds = agent.world.encode(&images, None).unwrap();
     let observed = agent.world.observe(&embeds, &actions, &first, &mut sampler).unwrap();
     let features = observed.posteriors.features().unwrap();
     let decoded = agent.world.decode(&observed.posteriors).unwrap();
@@ -169,7 +169,7 @@ fn imagination_and_filtering_agree_where_no_image_is_seen() {
         let images = Tensor::full(90u8, (1, 2, 64, 64, 3), device).unwrap();
         let actions = Tensor::full(1.7f32, (1, 2, 4), device).unwrap();
         let first = FirstSteps::new(vec![true, false], 2);
-        let embeds = agent.world.encode(&images).unwrap();
+        let embeds = agent.world.encode(&images, None).unwrap();
         let observed = agent.world.observe(&embeds, &actions, &first, &mut Sampler::Mode).unwrap();
         let step = |t: usize| move |x: &Tensor| x.narrow(1, t, 1)?.squeeze(1);
         let before = observed.posteriors.map(step(0)).unwrap();

@@ -16,6 +16,7 @@ use rcwm_trainer::cloning::{CloningLearner, CloningSettings, Ramp};
 use rcwm_trainer::learning::{CloningLoss, Examples, actions_taken};
 use rcwm_trainer::learning::{HostBatch, Side, side_of};
 use rcwm_trainer::model::latent::Sampler;
+use rcwm_trainer::replay::Replay;
 use rcwm_trainer::training::{
     FewshotSettings, Phase, Pretraining, Reset, ResetSettings, TrainingError, TrainingSettings,
     demonstrations, start_from,
@@ -152,12 +153,13 @@ fn the_action_of_a_state_is_the_one_that_led_to_the_next_image() {
     let taken: Vec<_> = actions_taken(&episode).collect();
     assert_eq!(taken.len(), 4);
     for (t, action) in taken {
-        assert_eq!(action.to_vec(), episode.action.row(t + 1).to_vec());
+        assert_eq!(action, episode.action.row(t + 1).to_vec());
     }
     // In a batch that runs on into another episode the last state of the first has no action.
     let features = Tensor::arange(0f32, 6.0, &Device::Cpu).unwrap().reshape((2, 3, 1)).unwrap();
     let first = [true, false, true, false, false, false];
     let batch = HostBatch {
+        side: 64,
         rows: 2,
         length: 3,
         image: vec![0; 6 * IMAGE_BYTES],
@@ -191,14 +193,14 @@ fn only_successful_episodes_of_the_task_are_demonstrations() {
     }
     let found = |task: &str, count| {
         let settings = FewshotSettings { demonstrations: count, ..FewshotSettings::default() };
-        let replay = demonstrations(folder.path(), task, &settings, 1000, || ()).unwrap();
+        let replay = demonstrations(folder.path(), task, &settings, Replay::new(1000), || ()).unwrap();
         let lengths = replay.tasks().flat_map(|(_, episodes)| episodes.into_iter().map(|e| e.len()));
         lengths.collect::<Vec<_>>()
     };
     assert_eq!(found("hammer", 2), [5, 6]);
     // Two steps after the success, which is at the last step but one.
     let settings = FewshotSettings { steps_after_success: 0, ..FewshotSettings::default() };
-    let replay = demonstrations(folder.path(), "reach", &settings, 1000, || ()).unwrap();
+    let replay = demonstrations(folder.path(), "reach", &settings, Replay::new(1000), || ()).unwrap();
     let (_, episodes) = replay.tasks().next().unwrap();
     assert!(
         episodes[0].len() <= 8 && episodes[0].success.iter().position(|s| *s) == Some(episodes[0].len() - 1)
@@ -208,6 +210,6 @@ fn only_successful_episodes_of_the_task_are_demonstrations() {
     for name in ["b", "c", "d"] {
         fs::remove_file(folder.path().join("hammer").join(name).with_extension("npz")).unwrap();
     }
-    let none = demonstrations(folder.path(), "hammer", &FewshotSettings::default(), 1000, || ());
+    let none = demonstrations(folder.path(), "hammer", &FewshotSettings::default(), Replay::new(1000), || ());
     assert!(matches!(none, Err(TrainingError::NoDemonstrations { episodes: 1, .. })));
 }

@@ -272,7 +272,7 @@ fn one_filter_step_after_another_is_the_filter() {
         let actions: Vec<f32> = (0..rows * length * 4).map(|at| (at % 7) as f32 / 3.0 - 1.0).collect();
         let actions = Tensor::from_vec(actions, (rows, length, 4), &Device::Cpu).unwrap();
         let first = FirstSteps::new((0..rows * length).map(|at| at % length == 0).collect(), length);
-        let embeds = agent.world.encode(&images).unwrap();
+        let embeds = agent.world.encode(&images, None).unwrap();
         let whole = agent.world.observe(&embeds, &actions, &first, &mut Sampler::Mode).unwrap().posteriors;
         let whole = whole.features().unwrap();
         let mut state = agent.world.initial(rows).unwrap();

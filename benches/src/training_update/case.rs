@@ -161,6 +161,7 @@ pub fn behaviour_settings(scale: Scale) -> BehaviourSettings {
 pub fn host_batch(Scale { batch, length, .. }: Scale) -> HostBatch {
     let steps = batch * length;
     HostBatch {
+        side: 64,
         rows: batch,
         length,
         image: (0..steps * IMAGE_BYTES).map(|i| (i / 7 % 251) as u8).collect(),

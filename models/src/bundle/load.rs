@@ -199,14 +199,7 @@ impl Manifest {
             )));
         }
         self.check_limits()?;
-        for name in &self.policy.inputs {
-            let camera = self.interface.camera.iter().any(|camera| camera.name == *name);
-            if !camera && !self.interface.state.iter().any(|state| state.name == *name) {
-                return Err(BundleError::Invalid(format!(
-                    "policy.inputs: {name:?} is no camera or state of the interface"
-                )));
-            }
-        }
+        self.check_inputs()?;
         for part in PartName::REQUIRED {
             if !self.parts.iter().any(|entry| entry.name == part) {
                 return Err(BundleError::Part { part, problem: "missing" });
@@ -239,6 +232,37 @@ impl Manifest {
         };
         let widest = || Limits { low: all(|action| &action.low), high: all(|action| &action.high) };
         self.policy.limits.clone().unwrap_or_else(widest)
+    }
+
+    /// The sizes of what the policy reads must be those of the model.
+    fn check_inputs(&self) -> Result<(), BundleError> {
+        let (model, mut cameras, mut numbers) = (&self.model, 0, 0);
+        for name in &self.policy.inputs {
+            if let Some(camera) = self.interface.camera.iter().find(|camera| camera.name == *name) {
+                cameras += 1;
+                let needed = [model.image_side, model.image_side, 3];
+                if camera.shape != needed {
+                    return Err(BundleError::Invalid(format!(
+                        "camera {name} is {:?}, the model sees {needed:?}",
+                        camera.shape
+                    )));
+                }
+            } else if let Some(range) = self.interface.state_range(name) {
+                numbers += range.len();
+            } else {
+                return Err(BundleError::Invalid(format!(
+                    "policy.inputs: {name:?} is no camera or state of the interface"
+                )));
+            }
+        }
+        let (needed, found) = ((model.cameras, model.state), (cameras, numbers));
+        if needed != found {
+            return Err(BundleError::Invalid(format!(
+                "policy.inputs name {} cameras and states of {} numbers, the model reads {} and {}",
+                found.0, found.1, needed.0, needed.1
+            )));
+        }
+        Ok(())
     }
 
     fn check_limits(&self) -> Result<(), BundleError> {

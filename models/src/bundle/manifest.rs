@@ -4,7 +4,6 @@ use serde::{Deserialize, Serialize};
 
 use crate::interface::Interface;
 use crate::settings::ModelSettings;
-use crate::{IMAGE_CHANNELS, IMAGE_SIDE};
 
 /// Version of the bundle format this crate reads and writes.
 pub const FORMAT: u32 = 2;
@@ -137,7 +136,7 @@ pub enum DType {
     F32,
 }
 
-/// The parts of a policy. `n`, `m`, `d` and `c` are those of [`ModelSettings`], `k = d / m`.
+/// The parts of a policy. `n`, `m`, `d`, `c`, `S` and `C` are those of [`ModelSettings`], `k = d / m`.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord, Hash, Serialize, Deserialize)]
 #[serde(rename_all = "lowercase")]
 pub enum PartName {
@@ -196,9 +195,10 @@ impl PartName {
     pub fn signature(self, model: &ModelSettings) -> (Vec<TensorSpec>, Vec<TensorSpec>) {
         use DType::{F32, I64, U8};
         let (n, m, d) = (model.categoricals, model.classes, model.deter);
+        let (side, channels, small) = (model.image_side, model.image_channels(), model.feature_side());
         let k = model.interaction_rows();
         let spec = TensorSpec::new;
-        let features = spec("features", F32, &[1, 2 * model.cnn_depth, IMAGE_SIDE / 4, IMAGE_SIDE / 4]);
+        let features = spec("features", F32, &[1, 2 * model.cnn_depth, small, small]);
         let noise = spec("noise", F32, &[2, n, m]);
         let branch_outputs = || {
             vec![
@@ -218,19 +218,19 @@ impl PartName {
             ]
         };
         match self {
-            Self::Encoder => {
-                (vec![spec("image", U8, &[1, IMAGE_SIDE, IMAGE_SIDE, IMAGE_CHANNELS])], vec![features])
-            }
-            Self::Robot => (
-                vec![
+            Self::Encoder => (vec![spec("image", U8, &[1, side, side, channels])], vec![features]),
+            Self::Robot => {
+                let mut inputs = vec![
                     spec("z", I64, &[1, n]),
                     spec("h", F32, &[1, d]),
                     spec("action", F32, &[1, model.action]),
                     features,
                     noise,
-                ],
-                branch_outputs(),
-            ),
+                ];
+                // As it was measured: the graph itself takes its symlog.
+                inputs.extend((model.state > 0).then(|| spec("state", F32, &[1, model.state])));
+                (inputs, branch_outputs())
+            }
             Self::Interaction => (
                 vec![
                     spec("robot_prior_z", I64, &[1, n]),
@@ -248,8 +248,8 @@ impl PartName {
             Self::Reward => (state(), vec![spec("reward", F32, &[1, 1])]),
             Self::Continue => (state(), vec![spec("continue_probability", F32, &[1, 1])]),
             Self::Decoder => {
-                let image = |name| spec(name, F32, &[1, IMAGE_SIDE, IMAGE_SIDE, IMAGE_CHANNELS]);
-                let mask = |name| spec(name, F32, &[1, IMAGE_SIDE, IMAGE_SIDE, 1]);
+                let image = |name| spec(name, F32, &[1, side, side, channels]);
+                let mask = |name| spec(name, F32, &[1, side, side, model.cameras]);
                 (
                     state(),
                     vec![

@@ -7,9 +7,9 @@
 //! golden.safetensors   ticks of inputs and the outputs the trainer computed for them
 //! ```
 //!
-//! **Golden tensors.** The first dimension counts ticks. Inputs: `input/image` u8 [K, 64, 64, 3], `input/action` f32 [K, 4]
-//! (as executed to get there), `input/is_first` u8 [K], `input/robot_noise` and `input/environment_noise` f32
-//! [K, 2, n, m] (first the prior's, then the posterior's). Outputs: `expect/<part>/<output>` with the shapes of
+//! **Golden tensors.** The first dimension counts ticks. Inputs: `input/image` u8 [K, S, S, 3 C], `input/action` f32
+//! [K, action] (as executed to get there), `input/is_first` u8 [K], `input/robot_noise` and `input/environment_noise` f32
+//! [K, 2, n, m] (first the prior's, then the posterior's), and `input/state` f32 [K, state] (as measured) where the model looks at it. Outputs: `expect/<part>/<output>` with the shapes of
 //! [`PartName::signature`], their leading 1 replaced by the number of ticks. Large ones (`features`, images) may cover
 //! only the first ticks. The state that enters tick t is the initial one where `is_first`, else the posterior of
 //! tick t-1.

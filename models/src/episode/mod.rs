@@ -2,13 +2,17 @@
 //!
 //! | key | type | shape | meaning |
 //! | --- | --- | --- | --- |
-//! | `image` | u8 | [T, 64, 64, 3] | upright, RGB |
-//! | `action` | f32 | [T, n] | the action that LED TO `image[t]`, in [-1, 1] from limit to limit; zeros at the first |
+//! | `image` | u8 | [T, S, S, 3] | upright, RGB; S is 64 or 128 |
+//! | `image_2` to `image_4` (optional) | u8 | [T, S, S, 3] | the same moments through further cameras |
+//! | `action` | f32 | [T, a] | the action that LED TO `image[t]`, in [-1, 1] from limit to limit; zeros at the first |
 //! | `reward` | f32 | [T] | of that transition |
 //! | `is_first`, `is_last`, `is_terminal`, `success` | bool | [T] | |
-//! | `robot_mask` (optional) | u8 | [T, 64, 64, 1] | 1 where the robot is, else 0 |
-//! | `proprio` (optional) | f32 | [T, 18] | joint positions and velocities |
-//! | `disturbed` (optional) | u8 | [T, 64, 64, 3] | the same moments in another look |
+//! | `robot_mask` (optional) | u8 | [T, S, S, 1] | 1 where the robot is, else 0 |
+//! | `proprio` (optional) | f32 | [T, p] | the robot's measured state: joint positions, velocities and the like |
+//! | `disturbed` (optional) | u8 | [T, S, S, 3] | the same moments in another look |
+//!
+//! `robot_mask` and `disturbed` have a `_2` to `_4` of their own, for every further camera or for none. In memory the cameras are side by
+//! side, pixel by pixel: an [`Episode`]'s images have 3 C channels.
 //!
 //! These are written. Read is what numpy reads and others write: numbers of any size and byte order, Fortran order, axes of length 1
 //! more or less (`[T, 1]` for `[T]`), masks as 0 and 255 or as numbers of objects. An action that stands at the image it was
@@ -23,8 +27,8 @@ use std::sync::Arc;
 use ndarray::{Array1, Array2, Array3, Array4, Axis, Slice};
 
 use crate::files::{FileError, read_capped, write_atomic, write_new};
+use crate::settings::ModelSettings;
 use crate::wire::{Format, Observation, ObservationFlags};
-use crate::{ACTION_LEN, IMAGE_CHANNELS, IMAGE_SIDE};
 
 /// Longest episode accepted, in steps.
 pub const STEPS_MAX: usize = 100_000;
@@ -34,9 +38,9 @@ pub const EPISODE_BYTES_MAX: u64 = 1 << 30;
 /// One episode, or the part of one that was seen.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Episode {
-    /// [T, 64, 64, 3].
+    /// [T, S, S, 3 C]: red, green and blue of the first camera, then of the next.
     pub image: Array4<u8>,
-    /// [T, 4]: the action that led to the image of the same step.
+    /// [T, action]: the action that led to the image of the same step.
     pub action: Array2<f32>,
     /// [T].
     pub reward: Array1<f32>,
@@ -50,11 +54,11 @@ pub struct Episode {
     pub success: Array1<bool>,
     /// [T], true where the action was a push off course and no example of what to do.
     pub pushed: Array1<bool>,
-    /// [T, 64, 64], true where the robot is.
+    /// [T, S, S * C], true where the robot is; a pixel's cameras are side by side.
     pub robot_mask: Option<Array3<bool>>,
-    /// [T, 18].
+    /// [T, state]: what the robot measured of itself.
     pub proprio: Option<Array2<f32>>,
-    /// [T, 64, 64, 3]: what `image` shows, in another look.
+    /// [T, S, S, 3 C]: what `image` shows, in another look.
     pub disturbed: Option<Array4<u8>>,
 }
 
@@ -91,14 +95,30 @@ pub enum EpisodeError {
     Order(String),
 }
 
+/// What an episode has in another size than a model needs it.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub struct Misfit {
+    /// The array's name.
+    pub key: &'static str,
+    pub found: String,
+    /// What the model needs.
+    pub expected: String,
+}
+
 impl Episode {
-    /// `steps` black pictures with zero actions and rewards, no masks; the first step is marked as such.
+    /// [`Episode::blank_of`] the paper's robot: one camera of 64 x 64, four numbers.
     #[must_use]
     pub fn blank(steps: usize) -> Self {
+        Self::blank_of(steps, 64, 1, 4)
+    }
+
+    /// `steps` black pictures with zero actions and rewards, no masks; the first step is marked as such.
+    #[must_use]
+    pub fn blank_of(steps: usize, side: usize, cameras: usize, action: usize) -> Self {
         let no = Array1::from_elem(steps, false);
         Self {
-            image: Array4::zeros((steps, IMAGE_SIDE, IMAGE_SIDE, IMAGE_CHANNELS)),
-            action: Array2::zeros((steps, ACTION_LEN)),
+            image: Array4::zeros((steps, side, side, 3 * cameras)),
+            action: Array2::zeros((steps, action)),
             reward: Array1::zeros(steps),
             is_first: (0..steps).map(|step| step == 0).collect(),
             is_last: no.clone(),
@@ -121,6 +141,39 @@ impl Episode {
     #[must_use]
     pub fn is_empty(&self) -> bool {
         self.reward.is_empty()
+    }
+
+    /// `S`: the images' side.
+    #[must_use]
+    pub fn side(&self) -> usize {
+        self.image.len_of(Axis(1))
+    }
+
+    /// What does not fit a model of these sizes, if anything. A state that the model does not look at may be anything.
+    #[must_use]
+    pub fn misfit(&self, model: &ModelSettings) -> Option<Misfit> {
+        let images = |side: usize, channels: usize| {
+            let cameras = channels / 3;
+            format!("{side} x {side} of {cameras} {}", if cameras == 1 { "camera" } else { "cameras" })
+        };
+        let (found, needed) = (
+            images(self.side(), self.image.len_of(Axis(3))),
+            images(model.image_side, model.image_channels()),
+        );
+        if found != needed {
+            return Some(Misfit { key: "image", found, expected: needed });
+        }
+        let numbers = |count: usize| format!("of {count} numbers");
+        let action = self.action.ncols();
+        if action != model.action {
+            return Some(Misfit { key: "action", found: numbers(action), expected: numbers(model.action) });
+        }
+        let state = self.proprio.as_ref().map(Array2::ncols);
+        (model.state > 0 && state != Some(model.state)).then(|| Misfit {
+            key: "proprio",
+            found: state.map_or_else(|| "missing".to_owned(), numbers),
+            expected: numbers(model.state),
+        })
     }
 
     /// Sum of the rewards.
@@ -199,6 +252,12 @@ pub fn robot_above(largest: f64) -> f64 {
     }
 }
 
+/// The side of all cameras of a robot, in pixels, and how many there are.
+fn cameras_of(format: &Format) -> (usize, usize) {
+    let cameras = &format.interface().camera;
+    (cameras.first().map_or(0, |camera| camera.shape[0]), cameras.len())
+}
+
 /// Collects observations into an [`Episode`].
 #[derive(Debug, Default)]
 pub struct EpisodeBuilder {
@@ -252,8 +311,13 @@ impl EpisodeBuilder {
         if self.len() == STEPS_MAX {
             return refuse("the episode is too long");
         }
-        if observation.format().interface().camera.is_empty() {
-            return refuse("the robot has no camera");
+        let sizes = &observation.format().interface().camera;
+        let fits = sizes.first().is_some_and(|first| {
+            let [rows, columns, _] = first.shape;
+            rows == columns && sizes.iter().all(|camera| camera.shape == first.shape)
+        });
+        if !fits {
+            return refuse("its cameras are not square and of one size; crop them on the robot's side");
         }
         if !observation.is_finite() {
             return refuse("a number is not finite");
@@ -265,15 +329,24 @@ impl EpisodeBuilder {
         if format != observation.format() {
             return refuse("it is of another interface than those before it");
         }
-        self.image.extend_from_slice(observation.image(0));
+        let (side, cameras) = cameras_of(format);
+        // The cameras side by side, pixel by pixel.
+        for pixel in 0..side * side {
+            for camera in 0..cameras {
+                self.image.extend_from_slice(&observation.image(camera)[3 * pixel..3 * pixel + 3]);
+            }
+        }
         let from = self.action.len();
         self.action.resize(from + format.action_numbers(), 0.0);
         // Finite: see above.
         let _ = format.normaliser().from_units(observation.executed(), &mut self.action[from..]);
         self.reward.push(observation.reward);
         self.flags.push(flags);
-        if let Some(mask) = observation.mask(0) {
-            self.robot_mask.extend(mask.iter().map(|pixel| *pixel > 127));
+        let masks: Option<Vec<&[u8]>> = (0..cameras).map(|camera| observation.mask(camera)).collect();
+        if let Some(masks) = masks {
+            for pixel in 0..side * side {
+                self.robot_mask.extend(masks.iter().map(|mask| mask[pixel] > 127));
+            }
             self.masks += 1;
         }
         self.proprio.extend_from_slice(observation.state());
@@ -286,12 +359,14 @@ impl EpisodeBuilder {
         let this = std::mem::take(self);
         let steps = this.len();
         let format = this.format?;
-        let [rows, columns, channels] = format.interface().camera[0].shape;
         let bits = |flag| this.flags.iter().map(|flags| flags.contains(flag)).collect::<Array1<bool>>();
         let mut is_first = bits(ObservationFlags::FIRST);
         is_first[0] = true;
         let fits = "pushed in whole steps";
-        let mut action = Array2::from_shape_vec((steps, format.action_numbers()), this.action).expect(fits);
+        let (side, cameras) = cameras_of(&format);
+        let vectors =
+            |numbers: Vec<f32>| Array2::from_shape_vec((steps, numbers.len() / steps), numbers).expect(fits);
+        let mut action = vectors(this.action);
         // No action led to the first step of what was seen, also where it was joined in its middle.
         action.row_mut(0).fill(0.0);
         Some(Episode {
@@ -300,15 +375,12 @@ impl EpisodeBuilder {
             success: bits(ObservationFlags::SUCCESS),
             pushed: bits(ObservationFlags::PUSHED),
             is_first,
-            image: Array4::from_shape_vec((steps, rows, columns, channels), this.image).expect(fits),
+            image: Array4::from_shape_vec((steps, side, side, 3 * cameras), this.image).expect(fits),
             action,
             reward: this.reward.into(),
             robot_mask: (this.masks == steps)
-                .then(|| Array3::from_shape_vec((steps, rows, columns), this.robot_mask).expect(fits)),
-            proprio: Some(
-                Array2::from_shape_vec((steps, format.interface().state_numbers()), this.proprio)
-                    .expect(fits),
-            ),
+                .then(|| Array3::from_shape_vec((steps, side, side * cameras), this.robot_mask).expect(fits)),
+            proprio: Some(vectors(this.proprio)),
             disturbed: None,
         })
     }

@@ -4,7 +4,7 @@
 use std::io::{BufReader, Cursor, Read, Write};
 use std::path::Path;
 
-use ndarray::{Array1, Array4, ArrayD, Dimension, Ix1, Ix2, Ix3, Ix4};
+use ndarray::{Array1, Array3, Array4, ArrayD, Axis, Dimension, Ix1, Ix2, Ix3, Ix4, concatenate, stack};
 use ndarray_npy::WriteNpyExt;
 use zip::write::SimpleFileOptions;
 use zip::{CompressionMethod, ZipArchive, ZipWriter};
@@ -12,10 +12,26 @@ use zip::{CompressionMethod, ZipArchive, ZipWriter};
 use super::npy::{Array, Header};
 use super::{EPISODE_BYTES_MAX, Episode, EpisodeError, STEPS_MAX, robot_above};
 use crate::files::open_capped;
-use crate::{ACTION_LEN, IMAGE_CHANNELS, IMAGE_SIDE, PROPRIOCEPTION_LEN};
+use crate::settings::{ACTION_NUMBERS_MAX, CAMERAS_MAX, IMAGE_SIDES, STATE_NUMBERS_MAX};
 
+/// An array of each camera.
+type Cameras = [&'static str; CAMERAS_MAX];
+const IMAGE: Cameras = ["image", "image_2", "image_3", "image_4"];
+const MASK: Cameras = ["robot_mask", "robot_mask_2", "robot_mask_3", "robot_mask_4"];
+const DISTURBED_ALL: Cameras = ["disturbed", "disturbed_2", "disturbed_3", "disturbed_4"];
 /// Key of the pictures in another look.
-pub(super) const DISTURBED: &str = "disturbed";
+pub(super) const DISTURBED: &str = DISTURBED_ALL[0];
+/// Most bytes of all images of an episode: those of the most steps of one small camera.
+const IMAGE_BYTES_MAX: usize = STEPS_MAX * 64 * 64 * 3;
+
+/// Sizes that an archive has chosen.
+#[derive(Debug, Clone, Copy)]
+struct Sizes {
+    side: usize,
+    cameras: usize,
+    action: usize,
+    state: Option<usize>,
+}
 
 /// Whether the archive at `path` has an array of this name.
 pub(super) fn has(path: &Path, key: &str) -> Result<bool, EpisodeError> {
@@ -84,20 +100,79 @@ impl Reader<'_> {
         found.map(Some).map_err(|found| self.wrong(key, found, expected))
     }
 
+    /// The shape of an array as it is stored; none where it is not there or unreadable.
+    fn stored_shape(&mut self, key: &str) -> Option<Vec<usize>> {
+        let mut entry = self.archive.by_name(&format!("{key}.npy")).ok()?;
+        Some(Header::read(&mut entry).ok()?.shape)
+    }
+
+    /// Numbers of a vector a step, of at most `most`; none where there is no such array.
+    fn width(&mut self, key: &'static str, most: usize) -> Result<Option<usize>, EpisodeError> {
+        let Some(shape) = self.stored_shape(key) else { return Ok(None) };
+        let rest: Vec<usize> = shape.iter().skip(1).copied().filter(|size| *size != 1).collect();
+        match *rest.as_slice() {
+            [] => Ok(Some(1)),
+            [width] if (1..=most).contains(&width) => Ok(Some(width)),
+            _ => {
+                let expected = format!("numbers of shape [T, n], n from 1 to {most}");
+                Err(self.wrong(key, format!("of shape {shape:?}"), expected))
+            }
+        }
+    }
+
+    /// The sizes that the headers tell.
+    fn sizes(&mut self) -> Result<Sizes, EpisodeError> {
+        let shape = self.stored_shape("image").unwrap_or_default();
+        let side = shape.iter().skip(1).copied().find(|side| IMAGE_SIDES.contains(side));
+        let further =
+            IMAGE[1..].iter().take_while(|key| self.archive.index_for_name(&format!("{key}.npy")).is_some());
+        Ok(Sizes {
+            side: side.unwrap_or(IMAGE_SIDES[0]),
+            cameras: 1 + further.count(),
+            action: self.width("action", ACTION_NUMBERS_MAX)?.unwrap_or(1),
+            state: self.width("proprio", STATE_NUMBERS_MAX)?,
+        })
+    }
+
     /// Whether every array that is read is there and fits the images, before any of them is unpacked.
-    fn check_shapes(&mut self) -> Result<(), EpisodeError> {
-        let image = [IMAGE_SIDE, IMAGE_SIDE, IMAGE_CHANNELS];
+    fn check_shapes(&mut self) -> Result<Sizes, EpisodeError> {
+        let sizes = self.sizes()?;
+        let image = [sizes.side, sizes.side, 3];
         let shape = self.shape("image", &image)?.ok_or_else(|| self.missing("image"))?;
         self.steps = shape.first().copied();
-        for (key, axes) in [("action", &[ACTION_LEN][..]), ("reward", &[]), ("is_first", &[])] {
+        let bytes = shape.iter().product::<usize>() * sizes.cameras;
+        if bytes > IMAGE_BYTES_MAX {
+            let expected = format!("at most {IMAGE_BYTES_MAX} bytes of all cameras; cut the episode");
+            return Err(self.wrong("image", format!("of {bytes} bytes"), expected));
+        }
+        for (key, axes) in [("action", &[sizes.action][..]), ("reward", &[]), ("is_first", &[])] {
             self.shape(key, axes)?.ok_or_else(|| self.missing(key))?;
         }
         for key in ["is_terminal", "is_last", "success", "pushed"] {
             self.shape(key, &[])?;
         }
-        self.shape("robot_mask", &image[..2])?;
-        self.shape("proprio", &[PROPRIOCEPTION_LEN])?;
-        self.shape(DISTURBED, &image).map(drop)
+        for camera in 0..sizes.cameras {
+            self.shape(IMAGE[camera], &image)?;
+            self.shape(MASK[camera], &image[..2])?;
+            self.shape(DISTURBED_ALL[camera], &image)?;
+        }
+        self.shape("proprio", &[sizes.state.unwrap_or(1)])?;
+        Ok(sizes)
+    }
+
+    /// What `read` makes of every camera's array; none where the first has none, and then no camera may have one.
+    fn cameras<T>(
+        &mut self,
+        keys: &Cameras,
+        cameras: usize,
+        mut read: impl FnMut(&mut Self, &'static str) -> Result<Option<T>, EpisodeError>,
+    ) -> Result<Option<Vec<T>>, EpisodeError> {
+        let found = keys[..cameras].iter().map(|key| read(self, key)).collect::<Result<Vec<_>, _>>()?;
+        if found.iter().all(Option::is_none) {
+            return Ok(None);
+        }
+        let present = |(key, array): (&&'static str, Option<T>)| array.ok_or_else(|| self.missing(key));
+        keys.iter().zip(found).map(present).collect::<Result<Vec<_>, _>>().map(Some)
     }
 
     /// Numbers of any type; all must be finite.
@@ -121,9 +196,8 @@ impl Reader<'_> {
     }
 
     /// Masks as truth values, 0 and 1, 0 and 255, probabilities, or numbers of objects.
-    fn mask(&mut self) -> Result<Option<ndarray::Array<bool, Ix3>>, EpisodeError> {
-        let key = "robot_mask";
-        let Some(array) = self.array(key, &[IMAGE_SIDE, IMAGE_SIDE])? else { return Ok(None) };
+    fn mask(&mut self, key: &'static str, side: usize) -> Result<Option<Array3<bool>>, EpisodeError> {
+        let Some(array) = self.array(key, &[side, side])? else { return Ok(None) };
         let (mut least, mut most) = (0.0_f64, 0.0_f64);
         for number in array.numbers() {
             if !number.is_finite() {
@@ -136,7 +210,7 @@ impl Reader<'_> {
             return Err(self.wrong(key, format!("down to {least}"), expected.into()));
         }
         let above = if array.is_float() && most <= 1.0 { 0.5 } else { robot_above(most) };
-        Ok(Some(dimensions(array.map(|number| number > above))))
+        Ok(Some(dimensions::<_, Ix3>(array.map(|number| number > above))))
     }
 
     /// Refuses actions that stand at the image they were chosen on, one step early: danijar/dreamerv3 stores them so today.
@@ -185,10 +259,10 @@ pub(super) fn read(path: &Path, bytes: &[u8]) -> Result<Episode, EpisodeError> {
     };
     let archive = ZipArchive::new(Cursor::new(bytes)).map_err(broken)?;
     let mut reader = Reader { path, archive, steps: None };
-    reader.check_shapes()?;
-    let image = read_images(&mut reader, "image")?.ok_or_else(|| reader.missing("image"))?;
+    let sizes = reader.check_shapes()?;
+    let image = read_images(&mut reader, &IMAGE, sizes)?.ok_or_else(|| reader.missing("image"))?;
     let steps = image.shape()[0];
-    let action = reader.floats::<Ix2>("action", &[ACTION_LEN])?.ok_or_else(|| reader.missing("action"))?;
+    let action = reader.floats::<Ix2>("action", &[sizes.action])?.ok_or_else(|| reader.missing("action"))?;
     let reward = reader.floats::<Ix1>("reward", &[])?.ok_or_else(|| reader.missing("reward"))?;
     let is_first = reader.flags("is_first")?.ok_or_else(|| reader.missing("is_first"))?;
     let none = || Array1::from_elem(steps, false);
@@ -201,26 +275,58 @@ pub(super) fn read(path: &Path, bytes: &[u8]) -> Result<Episode, EpisodeError> {
         is_last: reader.flags("is_last")?.unwrap_or_else(none),
         success: reader.flags("success")?.unwrap_or_else(none),
         pushed: reader.flags("pushed")?.unwrap_or_else(none),
-        robot_mask: reader.mask()?,
-        proprio: reader.floats::<Ix2>("proprio", &[PROPRIOCEPTION_LEN])?,
-        disturbed: read_images(&mut reader, DISTURBED)?,
+        robot_mask: read_masks(&mut reader, sizes)?,
+        proprio: reader.floats::<Ix2>("proprio", &[sizes.state.unwrap_or(1)])?,
+        disturbed: read_images(&mut reader, &DISTURBED_ALL, sizes)?,
     };
     reader.check_actions(&episode)?;
     Ok(episode)
 }
 
-fn read_images(reader: &mut Reader<'_>, key: &'static str) -> Result<Option<Array4<u8>>, EpisodeError> {
-    let axes = [IMAGE_SIDE, IMAGE_SIDE, IMAGE_CHANNELS];
-    let Some(array) = reader.array(key, &axes)? else { return Ok(None) };
-    let expected = format!("uint8 of shape [T, {IMAGE_SIDE}, {IMAGE_SIDE}, {IMAGE_CHANNELS}]");
-    let images = array.into_bytes().map_err(|found| reader.wrong(key, found, expected))?;
-    Ok(Some(dimensions::<_, Ix4>(images)))
+const ALIKE: &str = "the cameras' shapes were checked before they were read";
+
+/// The images of all cameras, [T, S, S, 3 C].
+fn read_images(
+    reader: &mut Reader<'_>,
+    keys: &Cameras,
+    Sizes { side, cameras, .. }: Sizes,
+) -> Result<Option<Array4<u8>>, EpisodeError> {
+    let found = reader.cameras(keys, cameras, |reader, key| {
+        let Some(array) = reader.array(key, &[side, side, 3])? else { return Ok(None) };
+        let expected = format!("uint8 of shape [T, {side}, {side}, 3]");
+        let images = array.into_bytes().map_err(|found| reader.wrong(key, found, expected))?;
+        Ok(Some(dimensions::<_, Ix4>(images)))
+    })?;
+    Ok(found.map(|mut images| match images.len() {
+        1 => images.remove(0),
+        _ => {
+            let views: Vec<_> = images.iter().map(|images| images.view()).collect();
+            concatenate(Axis(3), &views).expect(ALIKE).as_standard_layout().into_owned()
+        }
+    }))
+}
+
+/// The masks of all cameras, [T, S, S * C].
+fn read_masks(
+    reader: &mut Reader<'_>,
+    Sizes { side, cameras, .. }: Sizes,
+) -> Result<Option<Array3<bool>>, EpisodeError> {
+    let found = reader.cameras(&MASK, cameras, |reader, key| reader.mask(key, side))?;
+    Ok(found.map(|mut masks| match masks.len() {
+        1 => masks.remove(0),
+        _ => {
+            let views: Vec<_> = masks.iter().map(|masks| masks.view()).collect();
+            let all = stack(Axis(3), &views).expect(ALIKE).as_standard_layout().into_owned();
+            let shape = (all.len_of(Axis(0)), side, side * cameras);
+            all.into_shape_with_order(shape).expect(ALIKE)
+        }
+    }))
 }
 
 /// Packs an episode into a compressed archive.
 pub(super) fn to_bytes(episode: &Episode) -> Result<Vec<u8>, String> {
     let mut zip = ZipWriter::new(Cursor::new(Vec::new()));
-    add(&mut zip, "image", &episode.image)?;
+    add_images(&mut zip, &IMAGE, &episode.image)?;
     add(&mut zip, "action", &episode.action)?;
     add(&mut zip, "reward", &episode.reward)?;
     for (key, flags) in [
@@ -235,25 +341,39 @@ pub(super) fn to_bytes(episode: &Episode) -> Result<Vec<u8>, String> {
         add(&mut zip, "pushed", &episode.pushed)?;
     }
     if let Some(mask) = &episode.robot_mask {
-        let with_channel = mask.mapv(u8::from).insert_axis(ndarray::Axis(3));
-        add(&mut zip, "robot_mask", &with_channel)?;
+        let cameras = episode.image.len_of(Axis(3)) / 3;
+        for (camera, key) in MASK.iter().enumerate().take(cameras) {
+            let pixels = mask.slice(ndarray::s![.., .., camera..;cameras]);
+            add(&mut zip, key, &pixels.mapv(u8::from).insert_axis(Axis(3)))?;
+        }
     }
     if let Some(proprio) = &episode.proprio {
         add(&mut zip, "proprio", proprio)?;
     }
     if let Some(disturbed) = &episode.disturbed {
-        add(&mut zip, DISTURBED, disturbed)?;
+        add_images(&mut zip, &DISTURBED_ALL, disturbed)?;
     }
     Ok(zip.finish().map_err(|error| error.to_string())?.into_inner())
 }
 
-fn add<T, D>(
+/// The images [T, S, S, 3 C], an array a camera.
+fn add_images(
+    zip: &mut ZipWriter<Cursor<Vec<u8>>>,
+    keys: &Cameras,
+    images: &Array4<u8>,
+) -> Result<(), String> {
+    let cameras = images.axis_chunks_iter(Axis(3), 3);
+    keys.iter().zip(cameras).try_for_each(|(key, images)| add(zip, key, &images))
+}
+
+fn add<S, D>(
     zip: &mut ZipWriter<Cursor<Vec<u8>>>,
     key: &str,
-    array: &ndarray::Array<T, D>,
+    array: &ndarray::ArrayBase<S, D>,
 ) -> Result<(), String>
 where
-    T: ndarray_npy::WritableElement,
+    S: ndarray::Data,
+    S::Elem: ndarray_npy::WritableElement,
     D: Dimension,
 {
     let mut bytes = Vec::new();

@@ -61,7 +61,7 @@ fn a_second_look_survives_the_file_and_a_pipe_in_its_place_is_not_waited_for() {
     let plain = Episode::blank(3);
     plain.write(&path).unwrap();
     assert!(!Episode::is_disturbed(&path).unwrap());
-    let image = Array4::from_elem((3, IMAGE_SIDE, IMAGE_SIDE, IMAGE_CHANNELS), 7);
+    let image = Array4::from_elem((3, 64, 64, 3), 7);
     let disturbed = Episode { disturbed: Some(image), ..plain };
     disturbed.write(&path).unwrap();
     assert!(Episode::is_disturbed(&path).unwrap());
@@ -84,4 +84,48 @@ fn a_damaged_file_is_one_clear_error() {
         std::fs::write(&path, &bytes[..len]).unwrap();
         assert!(Episode::read(&path).is_err(), "{len} bytes were accepted");
     }
+}
+
+/// Two cameras of 128 x 128, seven numbers of action, three of state; every pixel of a step differs from its neighbours.
+fn large() -> Episode {
+    let mut action = Array2::from_elem((2, 7), 0.5);
+    action.row_mut(0).fill(0.0);
+    let image = Array4::from_shape_fn((2, 128, 128, 6), |(t, y, x, c)| (t + 3 * y + 5 * x + 40 * c) as u8);
+    Episode {
+        disturbed: Some(image.mapv(|value| value / 2)),
+        image,
+        action,
+        robot_mask: Some(Array3::from_shape_fn((2, 128, 256), |(t, y, x)| (t + y + x) % 3 == 0)),
+        proprio: Some(Array2::from_shape_fn((2, 3), |(t, i)| (10 * t + i) as f32)),
+        ..Episode::blank_of(2, 128, 2, 7)
+    }
+}
+
+#[test]
+fn several_cameras_of_128_and_vectors_of_any_length_survive_the_file() {
+    let folder = tempfile::tempdir().unwrap();
+    let path = folder.path().join("episode.npz");
+    large().write(&path).unwrap();
+    assert_eq!(Episode::read(&path).unwrap(), large());
+    assert_eq!(npz::has(&path, "image_2").unwrap(), npz::has(&path, "robot_mask_2").unwrap());
+    assert!(!npz::has(&path, "image_3").unwrap());
+}
+
+#[test]
+fn what_does_not_fit_a_model_is_named_with_what_was_found_and_what_is_needed() {
+    use crate::settings::{ModelKind, Preset};
+    let small = ModelSettings::preset(Preset::Debug, ModelKind::Rcwm);
+    let fits = ModelSettings { image_side: 128, cameras: 2, action: 7, state: 3, ..small.clone() };
+    assert_eq!(large().misfit(&fits), None);
+    assert_eq!(large().misfit(&ModelSettings { state: 0, ..fits.clone() }), None, "not looked at");
+    let said = |episode: &Episode, model: ModelSettings| {
+        let Misfit { key, found, expected } = episode.misfit(&model).unwrap();
+        format!("{key}: {found}, {expected}")
+    };
+    assert_eq!(said(&large(), small), "image: 128 x 128 of 2 cameras, 64 x 64 of 1 camera");
+    let other = ModelSettings { action: 4, ..fits.clone() };
+    assert_eq!(said(&large(), other), "action: of 7 numbers, of 4 numbers");
+    let other = ModelSettings { state: 14, ..fits.clone() };
+    assert_eq!(said(&large(), other), "proprio: of 3 numbers, of 14 numbers");
+    assert_eq!(said(&Episode { proprio: None, ..large() }, fits), "proprio: missing, of 3 numbers");
 }

@@ -14,7 +14,7 @@ pub fn filter_step(
     actions: &Tensor,
     sampler: &mut Sampler,
 ) -> Result<State> {
-    let embeds = world.encode(&images.unsqueeze(1)?)?; // [K, 1, E] per branch
+    let embeds = world.encode(&images.unsqueeze(1)?, None)?; // [K, 1, E] per branch
     let embeds = embeds.iter().map(|embed| embed.squeeze(1)).collect::<Result<Vec<_>>>()?;
     match world {
         World::Rcwm(model) => rcwm_step(model, previous, &embeds, actions, sampler),

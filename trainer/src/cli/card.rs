@@ -6,6 +6,7 @@ use rcwm_models::bundle::Bundle;
 use rcwm_models::files::write_atomic;
 use rcwm_trainer::checkpoint::CheckpointSettings;
 use rcwm_trainer::evaluation::{ClosedLoopReport, ClosedLoopResults, ClosedLoopSettings};
+use rcwm_trainer::replay::Replay;
 use rcwm_trainer::training::{Phase, Run, TrainingSettings, demonstrations};
 
 /// Write a bundle's card: what it learnt from, what that cost, how often it succeeds
@@ -153,7 +154,7 @@ fn demonstrated(settings: &TrainingSettings) -> String {
         &settings.data,
         &settings.task,
         &settings.fewshot,
-        settings.replay.capacity_steps,
+        Replay::new(settings.replay.capacity_steps),
         || (),
     ) else {
         return format!("at most {count}");

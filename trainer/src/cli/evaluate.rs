@@ -223,7 +223,7 @@ impl Evaluate {
         let settings = self.open_loop_settings(films)?;
         let device = super::parse_device(&self.device)?;
         let models = self.models(&device)?;
-        let tasks = self.trajectories(data, &settings)?;
+        let tasks = self.trajectories(data, &settings, &models)?;
         let report = self.measure(&models, &tasks, &settings, &device, stop)?;
         self.json.as_deref().map_or(Ok(()), |file| super::write_json(file, &report))?;
         rcwm_models::out!("{}", report.table());
@@ -253,13 +253,19 @@ impl Evaluate {
         Ok(models)
     }
 
-    fn trajectories(&self, data: &Path, settings: &OpenLoopSettings) -> Result<Vec<TaskTrajectories>> {
+    fn trajectories(
+        &self,
+        data: &Path,
+        settings: &OpenLoopSettings,
+        models: &[(String, PathBuf, Checkpoint)],
+    ) -> Result<Vec<TaskTrajectories>> {
         let folder = Folder::list(data, self.masks.as_deref())?;
         bars::tell(&folder.notes());
         let bar = ProgressBar::new(folder.len() as u64)
             .with_style(ProgressStyle::with_template("loading {wide_bar} {pos}/{len} episodes")?);
         let bar = Bar::new(bar, "loading", "episodes");
-        let recordings = Recordings::load(&folder, || bar.inc(1))?;
+        let models: Vec<_> = models.iter().map(|(.., checkpoint)| &checkpoint.settings.model).collect();
+        let recordings = Recordings::load(&folder, &models, || bar.inc(1))?;
         bar.finish_and_clear();
         let tasks = TaskTrajectories::choose(&recordings, settings)?;
         for task in &tasks {

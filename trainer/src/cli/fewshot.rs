@@ -145,10 +145,8 @@ fn load(settings: &TrainingSettings) -> Result<Replay> {
     let bar = ProgressBar::new(fewshot.demonstrations as u64)
         .with_style(ProgressStyle::with_template("loading {wide_bar} {pos}/{len} demonstrations")?);
     let bar = bars::Bar::new(bar, "loading", "demonstrations");
-    let replay =
-        demonstrations(&settings.data, &settings.task, fewshot, settings.replay.capacity_steps, || {
-            bar.inc(1)
-        })?;
+    let empty = Replay::new(settings.replay.capacity_steps).fitting(&settings.model);
+    let replay = demonstrations(&settings.data, &settings.task, fewshot, empty, || bar.inc(1))?;
     bar.finish_and_clear();
     rcwm_models::outln!("{} demonstrations, {} steps", replay.episodes(), replay.steps());
     Ok(replay)

@@ -126,12 +126,12 @@ struct ModelArguments {
 }
 
 impl ModelArguments {
-    /// The resolved sizes.
+    /// The resolved sizes. They may be named as in the settings of a run, too: `model.cnn_depth`.
     fn settings(&self) -> Result<ModelSettings> {
-        let resolved = settings::with_overrides(
-            &ModelSettings::preset(self.preset.preset(), self.model.kind()),
-            &self.overrides,
-        )?;
+        let own = |text: &String| text.strip_prefix("model.").unwrap_or(text).to_owned();
+        let overrides: Vec<String> = self.overrides.iter().map(own).collect();
+        let preset = ModelSettings::preset(self.preset.preset(), self.model.kind());
+        let resolved = settings::with_overrides(&preset, &overrides)?;
         resolved.validate()?;
         Ok(resolved)
     }

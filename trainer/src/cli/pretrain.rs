@@ -200,7 +200,8 @@ fn load(settings: &TrainingSettings) -> Result<Replay> {
     let bar = ProgressBar::new(folder.len() as u64)
         .with_style(ProgressStyle::with_template("loading {wide_bar} {pos}/{len} episodes")?);
     let bar = bars::Bar::new(bar, "loading", "episodes");
-    let replay = folder.load(settings.replay.capacity_steps, || bar.inc(1))?;
+    let replay =
+        folder.load(Replay::new(settings.replay.capacity_steps).fitting(&settings.model), || bar.inc(1))?;
     bar.finish_and_clear();
     let masked = replay.masked();
     rcwm_models::outln!(
@@ -237,13 +238,14 @@ fn describe(line: &Line) -> String {
         line.number(name).map_or_else(String::new, |value| format!("{text}{value:.digits$}"))
     };
     format!(
-        "{} {:.2} updates/s, waiting {:.0}%  total {:.1} image {:.1}{} reward {:.3} kl {:.2}{}",
+        "{} {:.2} updates/s, waiting {:.0}%  total {:.1} image {:.1}{}{} reward {:.3} kl {:.2}{}",
         line.phase,
         number("updates_per_second"),
         100.0 * number("waiting_share"),
         number("losses.total"),
         number("losses.image"),
         optional("losses.robot_mask", " mask ", 1),
+        optional("losses.state_loss", " state ", 2),
         number("losses.reward"),
         number("losses.robot_kl"),
         optional("losses.environment_kl", " + ", 2),

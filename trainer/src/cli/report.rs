@@ -321,7 +321,7 @@ impl Work<'_> {
                 .with_style(ProgressStyle::with_template("loading {msg} {wide_bar} {pos}/{len} episodes")?)
                 .with_message(data.task.clone());
             let bar = Bar::new(bar, "loading", "episodes");
-            let read = Recordings::load(&data.folder, || bar.inc(1));
+            let read = Recordings::load(&data.folder, &[], || bar.inc(1));
             bar.finish_and_clear();
             *recordings = Some(read?);
         }

@@ -1,18 +1,15 @@
 use std::path::Path;
 
-use candle_core::{DType, Tensor};
+use candle_core::{D, DType, Tensor};
 use image::{Rgb, RgbImage};
-use rcwm_models::IMAGE_SIDE;
 
 use crate::model::world::Decoded;
 use crate::plots::{Colour, IMAGINED, INK, PAPER, PlotError, text_width, write_gif, write_png, write_text};
 
 /// How long a step of a film is shown, in hundredths of a second.
 pub(super) const STEP_CS: u16 = 10;
-const SIDE: u32 = IMAGE_SIDE as u32;
-/// Screen pixels per pixel of a picture.
-const SCALE: u32 = 2;
-pub(super) const CELL: u32 = SIDE * SCALE;
+/// Side of a picture on the screen: pictures of 64 are enlarged.
+pub(super) const CELL: u32 = 128;
 /// Between two pictures.
 pub(super) const GAP: u32 = 4;
 /// Thickness of the frame around imagined pictures.
@@ -24,7 +21,8 @@ pub(super) const WORDS_HEIGHT: u32 = 20;
 const TITLES: [&str; 7] =
     ["true", "imagined", "error", "robot", "robot mask", "environment", "environment mask"];
 
-/// What a model saw and then imagined, beside the truth: for every step its panels, each 64 * 64 pixels.
+/// What a model saw and then imagined, beside the truth: for every step its panels. Of several cameras the first is
+/// shown.
 #[derive(Debug, Clone)]
 pub struct Film {
     steps: Vec<Vec<Vec<Colour>>>,
@@ -32,9 +30,11 @@ pub struct Film {
 }
 
 impl Film {
-    /// The film of one row of a batch: `truth` u8 [B, T, 64, 64, 3] and what was decoded of the same steps.
+    /// The film of one row of a batch: `truth` u8 [B, T, S, S, 3 C] and what was decoded of the same steps.
     pub fn of(truth: &Tensor, decoded: &Decoded, row: usize, context: usize) -> candle_core::Result<Self> {
         let one = |x: &Tensor| x.get(row);
+        let cameras = truth.dim(D::Minus1)? / 3;
+        let colours = |values: &[f32]| colours(values, cameras);
         let branches =
             decoded.pictures.iter().map(|picture| Ok((one(&picture.masked()?)?, one(&picture.mask)?)));
         let branches = branches.collect::<candle_core::Result<Vec<_>>>()?;
@@ -143,9 +143,10 @@ pub(super) fn draw(on: &mut RgbImage, (left, top): (u32, u32), picture: &[Colour
             }
         }
     }
+    let side = picture.len().isqrt() as u32;
     for y in 0..CELL {
         for x in 0..CELL {
-            let pixel = picture[(y / SCALE * SIDE + x / SCALE) as usize];
+            let pixel = picture[(y * side / CELL * side + x * side / CELL) as usize];
             on.put_pixel(left + x, top + y, Rgb(pixel));
         }
     }
@@ -160,9 +161,10 @@ pub(super) fn lifted(values: Vec<f32>) -> Vec<f32> {
     values.into_iter().map(|x| x + 0.5).collect()
 }
 
-pub(super) fn colours(values: &[f32]) -> Vec<Colour> {
+/// The first camera's pixels.
+pub(super) fn colours(values: &[f32], cameras: usize) -> Vec<Colour> {
     let level = |value: f32| (value.clamp(0.0, 1.0) * 255.0).round() as u8;
-    values.as_chunks::<3>().0.iter().map(|pixel| pixel.map(level)).collect()
+    values.as_chunks::<3>().0.iter().step_by(cameras).map(|pixel| pixel.map(level)).collect()
 }
 
 #[cfg(test)]

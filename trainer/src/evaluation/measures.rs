@@ -1,5 +1,4 @@
 use candle_core::{DType, Result, Tensor};
-use rcwm_models::{IMAGE_CHANNELS, IMAGE_SIDE};
 use serde::{Deserialize, Serialize};
 
 use super::motion::changed;
@@ -8,14 +7,16 @@ use crate::model::agent::Agent;
 use crate::model::latent::State;
 use crate::model::world::Decoded;
 
-pub(super) const PIXELS: usize = IMAGE_SIDE * IMAGE_SIDE;
-pub(super) const VALUES: usize = PIXELS * IMAGE_CHANNELS;
+/// Pixels of all cameras in a step's image of [B, T, S, S, 3 C].
+pub(super) fn pixels_of(images: &Tensor) -> Result<usize> {
+    Ok(images.dims().iter().skip(2).product::<usize>() / 3)
+}
 
 /// What is measured of every step.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord, Serialize, Deserialize)]
 #[serde(rename_all = "snake_case")]
 pub enum Measure {
-    /// Squared error of the picture times the true robot mask, mean over the whole picture's 64 * 64 * 3 values: the robot dynamics
+    /// Squared error of the picture times the true robot mask, mean over the whole picture's values: the robot dynamics
     /// error (paper, 5.2 and Fig. 4). Values of a picture lie in [0, 1].
     RobotError,
     /// The same, mean over the robot's pixels only: does not grow with the robot's size in the picture.
@@ -66,7 +67,7 @@ impl Measure {
     pub const fn definition(self) -> &'static str {
         match self {
             Self::RobotError => {
-                "sum over pixels and channels of (imagined - true)^2 * true robot mask, divided by 64*64*3; pictures in [0, 1], whole \
+                "sum over pixels and channels of (imagined - true)^2 * true robot mask, divided by the picture's number of values; pictures in [0, 1], whole \
                  picture of the model, not clipped"
             }
             Self::RobotErrorOnRobot => {
@@ -76,7 +77,7 @@ impl Measure {
                 "intersection over union of the robot branch's mask above 0.5 and the true mask; steps where both are empty left out"
             }
             Self::ReconstructionError => {
-                "mean over 64*64*3 values of (imagined - true)^2; pictures in [0, 1], not clipped"
+                "mean over the picture's values of (imagined - true)^2; pictures in [0, 1], not clipped"
             }
             Self::RewardError => "absolute difference of the expected reward and the recorded one",
             Self::MovingError => {
@@ -165,16 +166,18 @@ pub fn traces(
     let rewarded = host(&batch.reward)?;
     let robot = match &batch.robot_mask {
         Some(mask) => host(mask)?,
-        None => vec![0.0; rows * whole * PIXELS],
+        None => vec![0.0; batch.image.elem_count() / 3],
     };
     let (imagined, rewards) = (host(&decoded.image)?, host(&rewards)?);
     // The first picture is the robot's, and of the baseline the only one.
     let mask = host(&decoded.pictures[0].mask)?;
+    let pixels = pixels_of(&batch.image)?;
+    let values = 3 * pixels;
     let trace = |row: usize| {
         let mut trace = Trace::with_capacity(length);
         let of = |t: usize| True {
-            image: &truth[(row * whole + t) * VALUES..][..VALUES],
-            robot: &robot[(row * whole + t) * PIXELS..][..PIXELS],
+            image: &truth[(row * whole + t) * values..][..values],
+            robot: &robot[(row * whole + t) * pixels..][..pixels],
         };
         for step in 0..length {
             let (place, t) = (row * length + step, from + step);
@@ -182,8 +185,8 @@ pub fn traces(
                 truth: of(t),
                 before: t.checked_sub(1).map(of),
                 seen: from.checked_sub(1).map(of),
-                imagined: &imagined[place * VALUES..][..VALUES],
-                mask: &mask[place * PIXELS..][..PIXELS],
+                imagined: &imagined[place * values..][..values],
+                mask: &mask[place * pixels..][..pixels],
             };
             let reward_error = f64::from((rewards[place] - rewarded[row * whole + t]).abs());
             for (measure, value) in Measure::ALL.into_iter().zip(frame.measures(reward_error)) {
@@ -238,7 +241,7 @@ impl Frame<'_> {
         let (mut both, mut either) = (0usize, 0usize);
         let (mut on_moving, mut moving_pixels) = (0.0, 0usize);
         let (mut on_changed, mut still) = (0.0, 0.0);
-        for at in 0..PIXELS {
+        for at in 0..self.mask.len() {
             let truth = self.truth.pixel(at);
             let squares: f64 =
                 (0..3).map(|c| (f64::from(self.imagined[3 * at + c]) - level(truth[c])).powi(2)).sum();
@@ -263,12 +266,12 @@ impl Frame<'_> {
         let share = |sum: f64, count: usize| (count > 0).then(|| sum / count as f64);
         let even = |value: Option<f64>| value.map(|value| (value, 1.0));
         [
-            even(share(on_robot, VALUES)),
-            even(share(on_robot, robot_pixels * IMAGE_CHANNELS)),
+            even(share(on_robot, self.imagined.len())),
+            even(share(on_robot, 3 * robot_pixels)),
             even(share(both as f64, either)),
-            even(share(all, VALUES)),
+            even(share(all, self.imagined.len())),
             even(Some(reward_error)),
-            share(on_moving, moving_pixels * IMAGE_CHANNELS).map(|error| (error, moving_pixels as f64)),
+            share(on_moving, 3 * moving_pixels).map(|error| (error, moving_pixels as f64)),
             (still > 0.0).then(|| (on_changed / still, still)),
         ]
     }
@@ -282,6 +285,9 @@ pub(super) fn level(value: u8) -> f64 {
 #[cfg(test)]
 mod tests {
     use super::*;
+
+    const PIXELS: usize = 64 * 64;
+    const VALUES: usize = 3 * PIXELS;
 
     fn frame<'a>(truth: True<'a>, imagined: &'a [f32], mask: &'a [f32]) -> Frame<'a> {
         Frame { truth, before: None, seen: None, imagined, mask }

@@ -2,16 +2,12 @@
 
 use ndarray::Axis;
 use rcwm_models::episode::Episode;
-use rcwm_models::{IMAGE_CHANNELS, IMAGE_SIDE};
 
 /// A pixel has changed where one of its channels differs by more than this many of 255 levels. Pictures of a scene that stands still
 /// differ by nothing; slow shadows stay below.
 pub const CHANGED_LEVELS: u8 = 16;
 /// The robot moves at a step if this many pixels, robot before or after, have changed.
 pub const ROBOT_PIXELS: usize = 16;
-
-const PIXELS: usize = IMAGE_SIDE * IMAGE_SIDE;
-const VALUES: usize = PIXELS * IMAGE_CHANNELS;
 
 /// Whether a pixel has changed.
 #[must_use]
@@ -27,7 +23,8 @@ pub fn robot_moves(episode: &Episode) -> Vec<bool> {
     let (Some(images), Some(masks)) = (images.as_slice(), masks.as_slice()) else {
         return vec![false; episode.image.len_of(Axis(0))];
     };
-    let frame = |t: usize| (&images[t * VALUES..][..VALUES], &masks[t * PIXELS..][..PIXELS]);
+    let pixels = masks.len() / episode.len().max(1); // of all cameras
+    let frame = |t: usize| (&images[3 * t * pixels..][..3 * pixels], &masks[t * pixels..][..pixels]);
     let moves = |t: usize| {
         let Some(before) = t.checked_sub(1) else { return false };
         let ((a, robot_a), (b, robot_b)) = (frame(before), frame(t));

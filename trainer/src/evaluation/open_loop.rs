@@ -19,7 +19,9 @@ pub fn open_loop(world: &World, batch: &Batch, context: usize, sampler: &mut Sam
 /// Posterior states of the first `steps` steps, [B, steps, ...]; every sequence begins an episode for the model.
 pub fn filtered(world: &World, batch: &Batch, steps: usize, sampler: &mut Sampler) -> Result<State> {
     let rows = batch.first.batch();
-    let embeds = world.encode(&batch.image.narrow(1, 0, steps)?.contiguous()?)?;
+    let part = |x: &Tensor| x.narrow(1, 0, steps)?.contiguous();
+    let state = batch.state.as_ref().map(part).transpose()?;
+    let embeds = world.encode(&part(&batch.image)?, state.as_ref())?;
     let first = FirstSteps::new((0..rows * steps).map(|index| index % steps == 0).collect(), steps);
     let actions = batch.action.narrow(1, 0, steps)?;
     Ok(world.observe(&embeds, &actions, &first, sampler)?.posteriors)

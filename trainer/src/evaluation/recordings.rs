@@ -3,6 +3,7 @@ use std::path::Path;
 use std::sync::Arc;
 
 use rcwm_models::episode::Episode;
+use rcwm_models::settings::ModelSettings;
 
 use crate::replay::{Folder, LoadError, ReplayError, check_episode};
 use crate::simulators::Script;
@@ -25,12 +26,19 @@ pub struct Recordings {
 }
 
 impl Recordings {
-    /// Reads those of a folder's episodes that have masks; `read` is called after each.
-    pub fn load(folder: &Folder, mut read: impl FnMut()) -> Result<Self, LoadError> {
+    /// Reads those of a folder's episodes that have masks; `read` is called after each. All episodes must fit every one of `models`.
+    pub fn load(
+        folder: &Folder,
+        models: &[&ModelSettings],
+        mut read: impl FnMut(),
+    ) -> Result<Self, LoadError> {
         let mut recordings = Self::default();
         for episode in folder.episodes() {
             let (task, path, episode) = episode?;
             let refused = |source| LoadError::Refused { path: path.to_path_buf(), source };
+            if let Some(misfit) = models.iter().find_map(|model| episode.misfit(model)) {
+                return Err(refused(ReplayError::Misfit { task: task.to_owned(), misfit }));
+            }
             recordings.add(task, kind_of(path), episode).map_err(refused)?;
             read();
         }

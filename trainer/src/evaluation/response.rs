@@ -1,10 +1,9 @@
 use std::collections::BTreeMap;
 
 use candle_core::{DType, Result, Tensor};
-use rcwm_models::ACTION_LEN;
 use serde::{Deserialize, Serialize};
 
-use super::measures::{PIXELS, True, VALUES, level};
+use super::measures::{True, level, pixels_of};
 use super::statistics::{Bootstrap, Interval};
 use crate::learning::Batch;
 use crate::model::rcwm::{ENVIRONMENT, ROBOT};
@@ -42,7 +41,8 @@ impl OtherActions {
 
     /// The actions of the steps from `context` on, [B, L, action], that take the place of a batch's.
     pub fn of(self, batch: &Batch, context: usize) -> Result<Tensor> {
-        let (motion, steps) = (ACTION_LEN - 1, batch.first.length() - context);
+        // The last number is the gripper's.
+        let (motion, steps) = (batch.action.dim(2)? - 1, batch.first.length() - context);
         let recorded = batch.action.narrow(1, context, steps)?;
         match self {
             Self::Still => {
@@ -182,9 +182,10 @@ pub fn differences(
         batch.image.flatten_all()?.to_vec1::<u8>()?,
         match &batch.robot_mask {
             Some(mask) => host(mask)?,
-            None => vec![0.0; steps.len() * length * PIXELS],
+            None => vec![0.0; batch.image.elem_count() / 3],
         },
     );
+    let pixels = pixels_of(&batch.image)?;
     let difference = |a: &Tensor, b: &Tensor| host(&(a - b)?);
     let picture = difference(&recorded.image, &other.image)?;
     let branch = |index: usize| -> Result<Option<Vec<f32>>> {
@@ -197,14 +198,14 @@ pub fn differences(
     let (robot_picture, environment) = (branch(ROBOT)?, branch(ENVIRONMENT)?);
     let of_row = |row: usize| {
         let of = |t: usize| True {
-            image: &truth[(row * length + t) * VALUES..][..VALUES],
-            robot: &robot[(row * length + t) * PIXELS..][..PIXELS],
+            image: &truth[(row * length + t) * 3 * pixels..][..3 * pixels],
+            robot: &robot[(row * length + t) * pixels..][..pixels],
         };
         let seen = of(context - 1);
         let mut found = [Difference::default(); Answer::ALL.len()];
         for t in context..steps[row] {
-            let (now, place) = (of(t), (row * (length - context) + t - context) * VALUES);
-            for at in 0..PIXELS {
+            let (now, place) = (of(t), (row * (length - context) + t - context) * 3 * pixels);
+            for at in 0..pixels {
                 let mut add = |answer: Answer, picture: Option<&Vec<f32>>| {
                     let Some(picture) = picture else { return };
                     found[answer as usize].add(
@@ -269,7 +270,7 @@ mod tests {
         let mut recordings = Recordings::default();
         let episode = Episode {
             image,
-            action: ndarray::Array2::from_shape_fn((STEPS, ACTION_LEN), |(t, i)| 0.1 * (t * 4 + i) as f32),
+            action: ndarray::Array2::from_shape_fn((STEPS, 4), |(t, i)| 0.1 * (t * 4 + i) as f32),
             robot_mask: Some(ndarray::Array3::from_shape_fn((STEPS, 64, 64), |(t, y, x)| is_robot(t, y, x))),
             ..Episode::blank(STEPS)
         };

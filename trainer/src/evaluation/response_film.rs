@@ -1,6 +1,6 @@
 use std::path::Path;
 
-use candle_core::Tensor;
+use candle_core::{D, Tensor};
 use image::{Rgb, RgbImage};
 
 use super::film::{CELL, GAP, LETTERS, STEP_CS, WORDS_HEIGHT, colours, draw, lifted, values};
@@ -26,7 +26,7 @@ pub struct ResponseFilm {
 }
 
 impl ResponseFilm {
-    /// The film of one row of a batch: `truth` u8 [B, T, 64, 64, 3], and what was imagined of its first `steps` steps but the context's.
+    /// The film of one row of a batch: `truth` u8 [B, T, S, S, 3 C], and what was imagined of its first `steps` steps but the context's.
     pub fn of(
         truth: &Tensor,
         (recorded, imagined): (&Decoded, &Decoded),
@@ -34,7 +34,7 @@ impl ResponseFilm {
         row: usize,
         (context, steps): (usize, usize),
     ) -> candle_core::Result<Self> {
-        let truth = truth.get(row)?;
+        let (truth, cameras) = (truth.get(row)?, truth.dim(D::Minus1)? / 3);
         let pictures = |decoded: &Decoded| -> candle_core::Result<Vec<Tensor>> {
             let branches = if decoded.pictures.len() > 1 { decoded.pictures.as_slice() } else { &[] };
             let branches = branches.iter().map(|picture| picture.masked()?.get(row));
@@ -54,7 +54,8 @@ impl ResponseFilm {
             let apart =
                 |(a, b): (&Vec<f32>, &Vec<f32>)| a.iter().zip(b).map(|(a, b)| (a - b).abs()).collect();
             let third: Vec<Vec<f32>> = first.iter().zip(&second).map(apart).collect();
-            Ok([first, second, third].map(|row| row.iter().map(|picture| colours(picture)).collect()))
+            Ok([first, second, third]
+                .map(|row| row.iter().map(|picture| colours(picture, cameras)).collect()))
         };
         let steps = (context..steps).map(step).collect::<candle_core::Result<_>>()?;
         Ok(Self { steps, context, other })

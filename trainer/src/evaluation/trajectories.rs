@@ -142,7 +142,8 @@ impl TaskTrajectories {
 
     /// Trajectories `from` to `to` as a batch with masks. The last step of an episode is repeated where a shorter trajectory needs it.
     pub fn batch(&self, from: usize, to: usize, device: &Device) -> Result<Batch, EvaluationError> {
-        let mut batch = HostBatch { rows: to - from, length: self.length, ..HostBatch::default() };
+        let states = self.chosen.iter().all(|chosen| chosen.episode.proprio.is_some());
+        let mut batch = HostBatch { rows: to - from, length: self.length, states, ..HostBatch::default() };
         for Trajectory { episode, start, .. } in &self.chosen[from..to] {
             let there = self.length.min(episode.len() - start);
             append_steps(&self.task, episode, *start, there, true, &mut batch)?;

@@ -11,26 +11,29 @@ impl Part<'_> {
     pub fn encoder(&mut self) {
         let (inputs, _) = PartName::Encoder.signature(self.settings);
         let image = self.graph.input(&inputs[0]);
-        let x = self.graph.cast_to_float(&image); // [1, 64, 64, 3]
+        let x = self.graph.cast_to_float(&image); // [1, S, S, 3 C]
         let full = self.graph.scalar(255.0);
         let x = self.graph.binary("Div", &x, &full);
         let x = self.graph.shift(&x, -0.5);
         let x = self.graph.transpose(&x, &[0, 3, 1, 2]);
-        let features = self.conv_stack("encoder.shared", x); // [1, 2c, 16, 16]
+        let features = self.conv_stack("encoder.shared", x, 2); // [1, 2c, S/4, S/4]
         self.graph.output("features", &features);
     }
 
     /// The robot branch (eq. 5, 6 left): z, h, action, features, noise -> h', prior and posterior.
     pub fn robot(&mut self) {
         let (inputs, _) = PartName::Robot.signature(self.settings);
-        let [z, h, action, features, noise] = self.inputs(&inputs);
+        let (inputs, state) = inputs.split_at(5);
+        let [z, h, action, features, noise] = self.inputs(inputs);
+        let state = state.first().map(|spec| self.graph.input(spec));
+        let state = state.map(|state| self.measured(&state));
         let nm = self.settings.stoch_width();
         let weight = "robot.input.linear.weight";
         let z_share = self.one_hot_product(&format!("{weight}.z"), &z, self.weights.rows(weight, 0, nm));
         let action = self.normalised_action(&action);
         let action_share = self.linear_share("robot.input.linear", &action, nm);
         let sum = self.graph.add(&z_share, &action_share);
-        self.branch("robot", &sum, &h, &features, &noise);
+        self.branch("robot", &sum, &h, &features, state.as_ref(), &noise);
     }
 
     /// The environment branch (eq. 5, 6 right): e, h, features, noise -> h', prior and posterior.
@@ -39,13 +42,23 @@ impl Part<'_> {
         let [e, h, features, noise] = self.inputs(&inputs);
         let e = self.graph.reshape(&e, &[1, self.settings.stoch_width()]);
         let sum = self.linear_share("environment.input.linear", &e, 0);
-        self.branch("environment", &sum, &h, &features, &noise);
+        self.branch("environment", &sum, &h, &features, None, &noise);
     }
 
     /// Declares the inputs.
     pub fn inputs<const N: usize>(&mut self, specs: &[TensorSpec]) -> [Value; N] {
         let values: Vec<Value> = specs.iter().map(|spec| self.graph.input(spec)).collect();
         values.try_into().expect("the part has as many inputs as its signature")
+    }
+
+    /// What the encoder makes of the measured state [1, state]: [1, hidden].
+    fn measured(&mut self, state: &Value) -> Value {
+        let (sign, size) = (self.graph.unary("Sign", state), self.graph.unary("Abs", state));
+        let size = self.graph.shift(&size, 1.0);
+        let size = self.graph.unary("Log", &size);
+        let symlog = self.graph.mul(&sign, &size);
+        let x = self.dense("encoder.state.0", &symlog);
+        self.dense("encoder.state.1", &x)
     }
 
     /// `a / max(1, |a|)`.
@@ -57,7 +70,15 @@ impl Part<'_> {
     }
 
     /// What both branches do after their input layer's product.
-    fn branch(&mut self, name: &str, input: &Value, h: &Value, features: &Value, noise: &Value) {
+    fn branch(
+        &mut self,
+        name: &str,
+        input: &Value,
+        h: &Value,
+        features: &Value,
+        state: Option<&Value>,
+        noise: &Value,
+    ) {
         let d = self.settings.deter;
         let x = self.norm_silu(&format!("{name}.input.norm"), input);
         let h_next = self.cell(name, &x, h);
@@ -67,13 +88,19 @@ impl Part<'_> {
         let prior = self.log_probs(&format!("{name}.prior.logits"), &hidden);
         let prior_z = self.draw(&prior, &noise[0]);
 
-        let embed = self.conv_stack(&format!("encoder.{name}"), features.clone()); // [1, 4c, 4, 4]
-        let embed = self.graph.reshape(&embed, &[1, 16 * 4 * self.settings.cnn_depth]);
+        let stages = self.settings.stages() - 2;
+        let embed = self.conv_stack(&format!("encoder.{name}"), features.clone(), stages); // [1, 4c, 4, 4]
+        let width = 16 * 4 * self.settings.cnn_depth;
+        let embed = self.graph.reshape(&embed, &[1, width]);
         // The share of h' needs no image, and can be ready when it comes.
         let dense = format!("{name}.posterior.dense");
         let h_share = self.linear_share(&format!("{dense}.linear"), &h_next, 0);
         let embed_share = self.linear_share(&format!("{dense}.linear"), &embed, d);
-        let sum = self.graph.add(&h_share, &embed_share);
+        let mut sum = self.graph.add(&h_share, &embed_share);
+        if let Some(state) = state {
+            let state_share = self.linear_share(&format!("{dense}.linear"), state, d + width);
+            sum = self.graph.add(&sum, &state_share);
+        }
         let hidden = self.norm_silu(&format!("{dense}.norm"), &sum);
         let posterior = self.log_probs(&format!("{name}.posterior.logits"), &hidden);
         let posterior_z = self.draw(&posterior, &noise[1]);
@@ -119,9 +146,9 @@ impl Part<'_> {
         self.graph.arg_max(&scores)
     }
 
-    /// Two convolutions with their normalisations.
-    fn conv_stack(&mut self, name: &str, x: Value) -> Value {
-        (0..2).fold(x, |x, index| {
+    /// Convolutions with their normalisations.
+    fn conv_stack(&mut self, name: &str, x: Value, stages: usize) -> Value {
+        (0..stages).fold(x, |x, index| {
             let weight = self.parameter(&format!("{name}.{index}.conv.weight"));
             let x = self.graph.conv_down(&x, &weight);
             self.channel_norm_silu(&format!("{name}.{index}.norm"), &x)

@@ -11,6 +11,7 @@ use rcwm_models::bundle::{
 };
 use rcwm_models::files::{sha256_hex, write_atomic};
 use rcwm_models::interface::Interface;
+use rcwm_models::settings::ModelSettings;
 use rcwm_models::tensors::{Tensors, Values};
 use rustix::fs::{CWD, RenameFlags, renameat_with};
 
@@ -62,8 +63,8 @@ pub fn write(
     let World::Rcwm(_) = agent.world else { return Err(ExportError::Vanilla) };
     let replaces = check_place(place, options.replace)?;
     let scene = match &options.golden_episode {
-        Some(path) => Scene::from_episode(path, options.golden_ticks)?,
-        None => Scene::synthetic(options.golden_ticks)?,
+        Some(path) => Scene::from_episode(path, options.golden_ticks, settings)?,
+        None => Scene::synthetic(options.golden_ticks, settings)?,
     };
 
     let parent = parent_of(place);
@@ -93,7 +94,7 @@ pub fn write(
         model: settings.clone(),
         kind: BundleKind::Rcwm,
         interface: options.interface.clone(),
-        policy: PolicyInputs { inputs: inputs_of(&options.interface), limits: None },
+        policy: PolicyInputs { inputs: inputs_of(&options.interface, settings), limits: None },
         provenance: provenance(checkpoint, options, &scene),
         initial,
         golden,
@@ -106,9 +107,11 @@ pub fn write(
     Ok(Bundle::open(place)?)
 }
 
-/// What the policy reads: the first camera.
-fn inputs_of(interface: &Interface) -> Vec<String> {
-    interface.camera.iter().take(1).map(|camera| camera.name.clone()).collect()
+/// What the policy reads: as many cameras as the model has, in the interface's order, and all states where it reads any.
+fn inputs_of(interface: &Interface, model: &ModelSettings) -> Vec<String> {
+    let cameras = interface.camera.iter().take(model.cameras).map(|camera| camera.name.clone());
+    let states = interface.state.iter().filter(|_| model.state > 0).map(|state| state.name.clone());
+    cameras.chain(states).collect()
 }
 
 fn provenance(checkpoint: &Checkpoint, options: &Options, scene: &Scene) -> Provenance {

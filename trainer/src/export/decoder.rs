@@ -15,8 +15,9 @@ impl Part<'_> {
         let mut masks = Vec::with_capacity(2);
         for (index, branch) in ["robot", "environment"].into_iter().enumerate() {
             let (image, mask) = self.picture(branch, &state.z[index], &state.h[index]);
-            masked.push(self.graph.mul(&image, &mask));
-            masks.push(mask);
+            let product = self.graph.mul(&image, &mask);
+            masked.push(self.channels(product, 3));
+            masks.push(self.channels(mask, 1));
         }
         let whole = self.graph.add(&masked[0], &masked[1]);
         self.graph.output("image", &whole);
@@ -26,7 +27,13 @@ impl Part<'_> {
         }
     }
 
-    /// One branch's image [1, 64, 64, 3] and mask [1, 64, 64, 1].
+    /// Of several cameras [1, S, S * C, each] those of a pixel on its channels: [1, S, S, each * C].
+    fn channels(&mut self, x: Value, each: usize) -> Value {
+        let (side, cameras) = (self.settings.image_side, self.settings.cameras);
+        if cameras == 1 { x } else { self.graph.reshape(&x, &[1, side, side, each * cameras]) }
+    }
+
+    /// One branch's image [1, S, S * C, 3] and mask [1, S, S * C, 1]; a pixel's cameras are side by side.
     fn picture(&mut self, branch: &str, z: &Value, h: &Value) -> (Value, Value) {
         let name = format!("decoder.{branch}");
         let (nm, d) = (self.settings.stoch_width(), self.settings.deter);
@@ -48,15 +55,20 @@ impl Part<'_> {
         let sum = self.graph.add(&sum, &bias);
 
         let mut x = self.graph.reshape(&sum, &[1, channels, 4, 4]);
-        for index in 0..3 {
+        let last = self.settings.stages() - 1;
+        for index in 0..last {
             let weight = self.parameter(&format!("{name}.{index}.conv.weight"));
             x = self.graph.conv_up(&x, &weight, None);
             x = self.channel_norm_silu(&format!("{name}.{index}.norm"), &x);
         }
-        let weight = self.parameter(&format!("{name}.3.conv.weight"));
-        let bias = self.parameter(&format!("{name}.3.conv.bias"));
-        let x = self.graph.conv_up(&x, &weight, Some(&bias)); // [1, 4, 64, 64]
-        let x = self.graph.transpose(&x, &[0, 2, 3, 1]);
+        let weight = self.parameter(&format!("{name}.{last}.conv.weight"));
+        let bias = self.parameter(&format!("{name}.{last}.conv.bias"));
+        let x = self.graph.conv_up(&x, &weight, Some(&bias)); // [1, 4 C, S, S]
+        let mut x = self.graph.transpose(&x, &[0, 2, 3, 1]);
+        let (side, cameras) = (self.settings.image_side, self.settings.cameras);
+        if cameras > 1 {
+            x = self.graph.reshape(&x, &[1, side, side * cameras, 4]);
+        }
         let pieces = self.graph.split(&x, 3, &[3, 1]);
         let mask = self.graph.unary("Sigmoid", &pieces[1]);
         (pieces[0].clone(), mask)

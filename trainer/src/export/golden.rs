@@ -83,13 +83,19 @@ impl Recorder<'_> {
         scene: &Scene,
         tick: usize,
     ) -> Result<State, ExportError> {
-        let image = scene.image(tick)?; // [1, 64, 64, 3]
-        let features = world.features(&image)?; // [1, 16, 16, 2c]
+        let image = scene.image(tick)?; // [1, S, S, 3 C]
+        let features = world.features(&image)?; // [1, S/4, S/4, 2c]
         if tick < LARGE_TICKS {
             self.expect(PartName::Encoder, "features", &features.permute((0, 3, 1, 2))?);
         }
         let robot_h = world.recur_robot(&before.branches[ROBOT], &scene.action(tick)?)?;
-        let robot = self.branch(PartName::Robot, world, ROBOT, robot_h, &features)?;
+        let robot = self.branch(
+            PartName::Robot,
+            world,
+            ROBOT,
+            robot_h,
+            world.embed_robot(&features, scene.state(tick)?.as_ref())?,
+        )?;
 
         let environment = &before.branches[ENVIRONMENT];
         let (e, attention) = world.interaction.forward(&robot.prior.z, &robot.h, &environment.z)?;
@@ -97,7 +103,13 @@ impl Recorder<'_> {
         self.expect(PartName::Interaction, "attention", &attention);
 
         let environment_h = world.recur_environment(&e, &environment.h)?;
-        let environment = self.branch(PartName::Environment, world, ENVIRONMENT, environment_h, &features)?;
+        let environment = self.branch(
+            PartName::Environment,
+            world,
+            ENVIRONMENT,
+            environment_h,
+            world.embed(ENVIRONMENT, &features)?,
+        )?;
         // One-hot rows exactly, as the runtime carries class indices.
         let state =
             State { branches: vec![robot.posterior, environment.posterior] }.map(|x| Ok(x.detach()))?;
@@ -115,11 +127,11 @@ impl Recorder<'_> {
         world: &Rcwm,
         index: usize,
         h: Tensor,
-        features: &Tensor,
+        embed: Tensor,
     ) -> Result<Drawn, ExportError> {
         let branch = &world.branches[index];
         let unimix = self.agent.settings.unimix;
-        let share = branch.embed_share(&world.embed(index, features)?)?;
+        let share = branch.embed_share(&embed)?;
         let (prior, posterior) = (branch.prior_logits(&h)?, branch.posterior_logits(&h, &share)?);
         let (prior_log_probs, posterior_log_probs) =
             (ops::log_probs(&prior, unimix)?, ops::log_probs(&posterior, unimix)?);

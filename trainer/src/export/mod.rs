@@ -22,7 +22,7 @@ use std::path::PathBuf;
 
 use prost::Message;
 use rcwm_models::bundle::{BundleError, PartName};
-use rcwm_models::episode::EpisodeError;
+use rcwm_models::episode::{EpisodeError, Misfit};
 use rcwm_models::files::FileError;
 use rcwm_models::settings::ModelSettings;
 use rcwm_models::tensors::TensorsError;
@@ -59,6 +59,11 @@ pub enum ExportError {
     /// The episode for the golden values is unusable.
     #[error("export: {0}")]
     Episode(#[from] EpisodeError),
+    /// The episode for the golden values was recorded of another robot.
+    #[error(
+        "export: {path} does not fit the model: {} is {}, expected {}", misfit.key, misfit.found, misfit.expected
+    )]
+    Misfit { path: PathBuf, misfit: Misfit },
     /// Golden values or initial state could not be written.
     #[error("export: {0}")]
     Tensors(#[from] TensorsError),

@@ -311,6 +311,7 @@ impl GpuLearner {
             total: values.total,
             image: values.image,
             robot_mask: values.robot_mask,
+            state: None,
             reward: values.reward,
             continues: values.continues,
             cloning: values.cloning,

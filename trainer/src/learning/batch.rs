@@ -1,7 +1,6 @@
 use std::ops::Range;
 
 use candle_core::{Device, Result, Tensor};
-use rcwm_models::{ACTION_LEN, IMAGE_CHANNELS, IMAGE_SIDE};
 
 use super::Jitter;
 use crate::model::latent::FirstSteps;
@@ -9,19 +8,21 @@ use crate::model::latent::FirstSteps;
 /// Sequences of experience as tensors.
 #[derive(Debug, Clone)]
 pub struct Batch {
-    /// u8 [B, T, 64, 64, 3].
+    /// u8 [B, T, S, S, 3 C].
     pub image: Tensor,
     /// What the encoders see in place of `image`, which the decoder is to draw all the same; of the same shape.
     pub seen: Option<Tensor>,
     /// The action that led to the image: [B, T, action].
     pub action: Tensor,
+    /// What the robot measured of itself, as it was measured: [B, T, state]; none where the model does not look at it.
+    pub state: Option<Tensor>,
     /// [B, T].
     pub reward: Tensor,
     /// 1 where the episode truly ended, else 0: [B, T].
     pub terminal: Tensor,
     /// Where episodes begin.
     pub first: FirstSteps,
-    /// 1 where the robot is, else 0: u8 or f32 [B, T, 64, 64, 1]; none when masks are not used.
+    /// 1 where the robot is, else 0: u8 or f32 [B, T, S, S, C]; none when masks are not used.
     pub robot_mask: Option<Tensor>,
     /// By row, then step: true where the action was a push off course and is no example.
     pub pushed: Vec<bool>,
@@ -40,6 +41,7 @@ impl Batch {
             image: part(&self.image)?,
             seen: self.seen.as_ref().map(part).transpose()?,
             action: part(&self.action)?,
+            state: self.state.as_ref().map(part).transpose()?,
             reward: part(&self.reward)?,
             terminal: part(&self.terminal)?,
             first: self.first.rows(rows),
@@ -57,6 +59,8 @@ pub struct HostBatch {
     pub rows: usize,
     /// T.
     pub length: usize,
+    /// S: side of the images.
+    pub side: usize,
     /// B * T images; empty where `place` tells them.
     pub image: Vec<u8>,
     /// B * T images that the encoders see; empty where these are the images.
@@ -70,6 +74,10 @@ pub struct HostBatch {
     pub masks: bool,
     /// B * T actions.
     pub action: Vec<f32>,
+    /// Whether the robot's measured state is used.
+    pub states: bool,
+    /// B * T states; empty where they are not used.
+    pub state: Vec<f32>,
     /// B * T rewards.
     pub reward: Vec<f32>,
     /// B * T flags.
@@ -101,20 +109,20 @@ impl HostBatch {
     /// # Errors
     /// Those of candle, also if a field has the wrong length.
     pub fn into_tensors(self, device: &Device) -> Result<Batch> {
-        let (b, t) = (self.rows, self.length);
+        let (b, t, side) = (self.rows, self.length, self.side);
         let terminal: Vec<f32> = self.terminal.iter().map(|flag| f32::from(u8::from(*flag))).collect();
-        let mask = |mask| Tensor::from_vec(mask, (b, t, IMAGE_SIDE, IMAGE_SIDE, 1), device);
-        let images =
-            |images| Tensor::from_vec(images, (b, t, IMAGE_SIDE, IMAGE_SIDE, IMAGE_CHANNELS), device);
+        let images = |images| Tensor::from_vec(images, (b, t, side, side, ()), device);
+        let vectors = |vectors| Tensor::from_vec(vectors, (b, t, ()), device);
         Ok(Batch {
             image: images(self.image)?,
             seen: if self.seen.is_empty() { None } else { Some(images(self.seen)?) },
-            action: Tensor::from_vec(self.action, (b, t, ACTION_LEN), device)?,
+            action: vectors(self.action)?,
+            state: if self.states { Some(vectors(self.state)?) } else { None },
             reward: Tensor::from_vec(self.reward, (b, t), device)?,
             terminal: Tensor::from_vec(terminal, (b, t), device)?,
             first: FirstSteps::new(self.first, t),
             pushed: self.pushed,
-            robot_mask: if self.robot_mask.is_empty() { None } else { Some(mask(self.robot_mask)?) },
+            robot_mask: if self.robot_mask.is_empty() { None } else { Some(images(self.robot_mask)?) },
             number: self.number,
         })
     }

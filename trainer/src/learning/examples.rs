@@ -1,11 +1,11 @@
 use std::sync::Arc;
 
 use candle_core::{Device, Result, Tensor};
+use ndarray::Axis;
 use rand::{Rng, SeedableRng};
 use rand_chacha::ChaCha8Rng;
 use rcwm_models::episode::Episode;
 use rcwm_models::settings::{ModelKind, ModelSettings};
-use rcwm_models::{ACTION_LEN, IMAGE_CHANNELS, IMAGE_SIDE};
 
 use super::batch::examples;
 use super::{Batch, Shift};
@@ -140,17 +140,23 @@ impl Padded {
         device: &Device,
     ) -> Result<Self> {
         let length = episodes.iter().map(|episode| episode.len()).max().unwrap_or(0);
+        let width = agent.settings.action;
         let (mut embeds, mut actions, mut first) = (Vec::new(), Vec::new(), Vec::new());
         let (mut chosen, mut taken) = (Vec::new(), Vec::new());
         for (row, episode) in episodes.iter().enumerate() {
             let missing = length - episode.len();
             let mut images: Vec<u8> = episode.image.iter().copied().collect();
-            shift(row).apply(&mut images, IMAGE_CHANNELS);
-            let shape = (1, episode.len(), IMAGE_SIDE, IMAGE_SIDE, IMAGE_CHANNELS);
-            let own = agent.world.encode(&Tensor::from_vec(images, shape, device)?)?;
+            let (steps, side) = (episode.len(), episode.side());
+            shift(row).apply(&mut images, side, episode.image.len_of(Axis(3)));
+            let images = Tensor::from_vec(images, (1, steps, side, side, ()), device)?;
+            let state = episode.proprio.as_ref().filter(|_| agent.settings.state > 0);
+            let state = state
+                .map(|state| Tensor::from_iter(state.iter().copied(), device)?.reshape((1, steps, ())))
+                .transpose()?;
+            let own = agent.world.encode(&images, state.as_ref())?;
             embeds.push(own.iter().map(|x| x.pad_with_zeros(1, 0, missing)).collect::<Result<Vec<_>>>()?);
             actions.extend(episode.action.iter().copied());
-            actions.extend(std::iter::repeat_n(0.0, missing * ACTION_LEN));
+            actions.extend(std::iter::repeat_n(0.0, missing * width));
             first.extend((0..length).map(|t| t == 0 || episode.is_first.get(t).is_some_and(|first| *first)));
             for (t, action) in actions_taken(episode) {
                 chosen.push((row * length + t) as u32);
@@ -163,17 +169,17 @@ impl Padded {
         let count = chosen.len();
         Ok(Self {
             embeds: (0..branches).map(stack).collect::<Result<_>>()?,
-            actions: Tensor::from_vec(actions, (rows, length, ACTION_LEN), device)?,
+            actions: Tensor::from_vec(actions, (rows, length, width), device)?,
             first: FirstSteps::new(first, length),
             chosen: Tensor::from_vec(chosen, count, device)?,
-            taken: Tensor::from_vec(taken, (count, ACTION_LEN), device)?,
+            taken: Tensor::from_vec(taken, (count, width), device)?,
         })
     }
 }
 
 /// The steps of an episode in which an action was taken that is an example, with the action, each in [-1, 1].
-pub fn actions_taken(episode: &Episode) -> impl Iterator<Item = (usize, [f32; ACTION_LEN])> {
-    let taken = move |t: usize| std::array::from_fn(|i| episode.action[[t + 1, i]].clamp(-1.0, 1.0));
+pub fn actions_taken(episode: &Episode) -> impl Iterator<Item = (usize, Vec<f32>)> {
+    let taken = |t: usize| episode.action.row(t + 1).iter().map(|x| x.clamp(-1.0, 1.0)).collect();
     (0..episode.len().saturating_sub(1))
         .filter(|t| !episode.is_first[t + 1] && !episode.pushed[t + 1])
         .map(move |t| (t, taken(t)))

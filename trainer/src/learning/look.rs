@@ -1,6 +1,5 @@
 use rand::{Rng, SeedableRng};
 use rand_chacha::ChaCha8Rng;
-use rcwm_models::IMAGE_CHANNELS;
 use serde::{Deserialize, Serialize};
 
 /// How the encoders see what is learned from. What the decoder is to draw stays as it is, so that a state says what is there and not how
@@ -51,9 +50,9 @@ pub struct Look {
 /// A change of colours, one for a whole sequence: `gain * (colour + saturation * (grey - colour)) + offset`.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct Jitter {
-    pub gain: [f32; IMAGE_CHANNELS],
+    pub gain: [f32; 3],
     /// By channel, of 255.
-    pub offset: [f32; IMAGE_CHANNELS],
+    pub offset: [f32; 3],
     /// Towards grey, or away from it where below 0.
     pub grey: f32,
 }
@@ -69,10 +68,10 @@ impl Jitter {
         }
     }
 
-    /// Changes pictures [..., 3] in place.
+    /// Changes pictures [..., 3 C] in place.
     pub fn apply(&self, pictures: &mut [u8]) {
-        for pixel in pictures.chunks_exact_mut(IMAGE_CHANNELS) {
-            let grey = pixel.iter().map(|x| f32::from(*x)).sum::<f32>() / IMAGE_CHANNELS as f32;
+        for pixel in pictures.as_chunks_mut::<3>().0 {
+            let grey = pixel.iter().map(|x| f32::from(*x)).sum::<f32>() / 3.0;
             for (channel, value) in pixel.iter_mut().enumerate() {
                 let colour = f32::from(*value);
                 let colour =

@@ -15,6 +15,8 @@ pub struct WorldLosses {
     pub image: Tensor,
     /// The same of the robot's mask; none when masks are not used.
     pub robot_mask: Option<Tensor>,
+    /// Squared error of the robot's measured state in symlog space, summed over its numbers; none where the model does not look at it.
+    pub state: Option<Tensor>,
     /// Cross-entropy of the reward.
     pub reward: Tensor,
     /// Cross-entropy of the continuation.
@@ -40,6 +42,9 @@ pub struct LossValues {
     #[serde(skip_serializing_if = "Option::is_none")]
     pub robot_mask: Option<f64>,
     /// See [`WorldLosses`].
+    #[serde(rename = "state_loss", skip_serializing_if = "Option::is_none")]
+    pub state: Option<f64>,
+    /// See [`WorldLosses`].
     pub reward: f64,
     /// See [`WorldLosses`].
     #[serde(rename = "continue")]
@@ -61,7 +66,8 @@ pub fn world_losses(
     settings: &WorldSettings,
     sampler: &mut Sampler,
 ) -> Result<WorldLosses> {
-    let embeds = part("encode", || agent.world.encode(batch.seen.as_ref().unwrap_or(&batch.image)))?;
+    let seen = batch.seen.as_ref().unwrap_or(&batch.image);
+    let embeds = part("encode", || agent.world.encode(seen, batch.state.as_ref()))?;
     let observed = part("observe", || agent.world.observe(&embeds, &batch.action, &batch.first, sampler))?;
     let reconstruction =
         part("decode", || reconstruction(agent, batch, settings.decode_every, &observed.posteriors))?;
@@ -98,6 +104,8 @@ fn other_losses(
 ) -> Result<WorldLosses> {
     let image = reconstruction.0.mean_all()?;
     let robot_mask = reconstruction.1.map(|loss| loss.mean_all()).transpose()?;
+    let state = agent.world.state_loss(&observed.posteriors, batch.state.as_ref())?;
+    let state = state.map(|loss| loss.mean_all()).transpose()?;
     let features = observed.posteriors.features()?; // [B, T, state width]
     let reward = agent.heads.reward.loss(&features, &batch.reward)?.mean_all()?;
     let continues = continue_loss(&agent.heads.continue_logit(&features)?, &batch.terminal)?;
@@ -114,10 +122,13 @@ fn other_losses(
     if let Some(mask) = &robot_mask {
         total = (total + (mask * settings.mask_scale)?)?;
     }
+    if let Some(state) = &state {
+        total = (total + (state * settings.state_scale)?)?;
+    }
     for branch in &branches {
         total = (total + branch.loss.mean_all()?)?;
     }
-    Ok(WorldLosses { image, robot_mask, reward, continues, branches, cloning: None, total, observed })
+    Ok(WorldLosses { image, robot_mask, state, reward, continues, branches, cloning: None, total, observed })
 }
 
 /// Binary cross-entropy of the logits [B, T, 1] against going on, where not `terminal` [B, T]: a scalar. As a softmax over the
@@ -135,6 +146,7 @@ impl WorldLosses {
         Self {
             image: self.image.detach(),
             robot_mask: self.robot_mask.as_ref().map(Tensor::detach),
+            state: self.state.as_ref().map(Tensor::detach),
             reward: self.reward.detach(),
             continues: self.continues.detach(),
             branches: self.branches.iter().map(BranchKl::detached).collect(),
@@ -160,6 +172,7 @@ impl WorldLosses {
         Ok(Self {
             image: all(|losses| Some(&losses.image))?,
             robot_mask: sum(|losses| losses.robot_mask.as_ref())?,
+            state: sum(|losses| losses.state.as_ref())?,
             reward: all(|losses| Some(&losses.reward))?,
             continues: all(|losses| Some(&losses.continues))?,
             branches: (0..shares.first().map_or(0, |(_, losses)| losses.branches.len()))
@@ -180,6 +193,7 @@ impl WorldLosses {
             total: scalar(&self.total)?,
             image: scalar(&self.image)?,
             robot_mask: self.robot_mask.as_ref().map(scalar).transpose()?,
+            state: self.state.as_ref().map(scalar).transpose()?,
             reward: scalar(&self.reward)?,
             continues: scalar(&self.continues)?,
             cloning: self.cloning.as_ref().map(scalar).transpose()?,

@@ -10,6 +10,8 @@ pub struct WorldSettings {
     pub image_scale: f64,
     /// Factor of the robot mask's loss, where masks are used.
     pub mask_scale: f64,
+    /// Factor of the measured state's loss, where the model looks at it.
+    pub state_scale: f64,
     /// Factor of the reward's cross-entropy.
     pub reward_scale: f64,
     /// Factor of the continuation's cross-entropy.
@@ -34,6 +36,7 @@ impl Default for WorldSettings {
         Self {
             image_scale: 1.0,
             mask_scale: 1.0,
+            state_scale: 1.0,
             reward_scale: 100.0,
             continue_scale: 1.0,
             dynamics_scale: 0.5,

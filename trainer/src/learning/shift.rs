@@ -1,6 +1,5 @@
 use rand::{Rng, SeedableRng};
 use rand_chacha::ChaCha8Rng;
-use rcwm_models::{IMAGE_CHANNELS, IMAGE_SIDE};
 
 use super::HostBatch;
 
@@ -22,18 +21,18 @@ impl Shift {
         Self { right: draw(), down: draw() }
     }
 
-    /// Shifts pictures [..., 64, 64, channels] in place.
-    pub fn apply(self, pictures: &mut [u8], channels: usize) {
+    /// Shifts pictures [..., side, side, channels] in place.
+    pub fn apply(self, pictures: &mut [u8], side: usize, channels: usize) {
         if self == Self::default() {
             return;
         }
-        let from = |at: usize, by: isize| at.saturating_add_signed(-by).min(IMAGE_SIDE - 1);
-        let mut before = vec![0; IMAGE_SIDE * IMAGE_SIDE * channels];
+        let from = |at: usize, by: isize| at.saturating_add_signed(-by).min(side - 1);
+        let mut before = vec![0; side * side * channels];
         for picture in pictures.chunks_exact_mut(before.len()) {
             before.copy_from_slice(picture);
             for (at, pixel) in picture.chunks_exact_mut(channels).enumerate() {
-                let (row, column) = (from(at / IMAGE_SIDE, self.down), from(at % IMAGE_SIDE, self.right));
-                let source = (row * IMAGE_SIDE + column) * channels;
+                let (row, column) = (from(at / side, self.down), from(at % side, self.right));
+                let source = (row * side + column) * channels;
                 pixel.copy_from_slice(&before[source..source + channels]);
             }
         }
@@ -46,16 +45,19 @@ impl HostBatch {
         if pixels == 0 || self.rows == 0 {
             return;
         }
-        let area = self.length * IMAGE_SIDE * IMAGE_SIDE;
+        let (side, area) = (self.side, self.length * self.side * self.side);
+        let channels = |bytes: usize| bytes / (self.rows * area);
+        let (channels, masks) = (channels(self.image.len()), channels(self.robot_mask.len()));
         for row in 0..self.rows {
             let shift = Shift::drawn(pixels, seed, number, row);
-            let pixels = row * area * IMAGE_CHANNELS..(row + 1) * area * IMAGE_CHANNELS;
-            shift.apply(&mut self.image[pixels.clone()], IMAGE_CHANNELS);
+            let pixels = row * area * channels..(row + 1) * area * channels;
+            shift.apply(&mut self.image[pixels.clone()], side, channels);
             if let Some(seen) = self.seen.get_mut(pixels) {
-                shift.apply(seen, IMAGE_CHANNELS);
+                shift.apply(seen, side, channels);
             }
-            if let Some(masks) = self.robot_mask.get_mut(row * area..(row + 1) * area) {
-                shift.apply(masks, 1);
+            if masks > 0 {
+                let pixels = row * area * masks..(row + 1) * area * masks;
+                shift.apply(&mut self.robot_mask[pixels], side, masks);
             }
         }
     }
@@ -66,14 +68,16 @@ mod tests {
     use super::*;
 
     const LENGTH: usize = 2;
-    const AREA: usize = IMAGE_SIDE * IMAGE_SIDE;
+    const SIDE: usize = 64;
+    const AREA: usize = SIDE * SIDE;
 
     fn batch() -> HostBatch {
         let number = |at: usize, every: usize| (at / every % 251) as u8;
         HostBatch {
             rows: 2,
             length: LENGTH,
-            image: (0..2 * LENGTH * AREA * IMAGE_CHANNELS).map(|at| number(at, IMAGE_CHANNELS)).collect(),
+            side: SIDE,
+            image: (0..2 * LENGTH * AREA * 3).map(|at| number(at, 3)).collect(),
             robot_mask: (0..2 * LENGTH * AREA).map(|at| number(at, 1)).collect(),
             ..HostBatch::default()
         }
@@ -81,11 +85,10 @@ mod tests {
 
     #[test]
     fn a_picture_moves_and_its_edge_fills_the_gap() {
-        let mut picture: Vec<u8> =
-            (0..AREA).map(|at| (at / IMAGE_SIDE + 3 * (at % IMAGE_SIDE)) as u8).collect();
+        let mut picture: Vec<u8> = (0..AREA).map(|at| (at / SIDE + 3 * (at % SIDE)) as u8).collect();
         let before = picture.clone();
-        Shift { right: 2, down: -1 }.apply(&mut picture, 1);
-        let at = |picture: &[u8], row: usize, column: usize| picture[row * IMAGE_SIDE + column];
+        Shift { right: 2, down: -1 }.apply(&mut picture, SIDE, 1);
+        let at = |picture: &[u8], row: usize, column: usize| picture[row * SIDE + column];
         assert_eq!(at(&picture, 10, 10), at(&before, 11, 8));
         assert_eq!(at(&picture, 10, 1), at(&before, 11, 0));
         assert_eq!(at(&picture, 63, 30), at(&before, 63, 28));
@@ -105,9 +108,9 @@ mod tests {
             for step in 0..LENGTH {
                 let start = (row * LENGTH + step) * AREA;
                 let mut expected = batch().robot_mask[start..start + AREA].to_vec();
-                shift.apply(&mut expected, 1);
+                shift.apply(&mut expected, SIDE, 1);
                 assert_eq!(shifted.robot_mask[start..start + AREA], expected);
-                let red = shifted.image[start * IMAGE_CHANNELS..].iter().step_by(IMAGE_CHANNELS);
+                let red = shifted.image[start * 3..].iter().step_by(3);
                 assert!(red.take(AREA).eq(&expected));
             }
             found.push(shift);

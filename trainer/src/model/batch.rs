@@ -44,7 +44,7 @@ impl Observed {
 /// Pictures of a state.
 #[derive(Debug, Clone)]
 pub struct Decoded {
-    /// The whole picture [..., 64, 64, 3], in the range of `x/255 - 0.5` (eq. 8).
+    /// The whole picture [..., S, S, 3 C], in the range of `x/255 - 0.5` (eq. 8).
     pub image: Tensor,
     /// Each branch's part in it, the robot's first.
     pub pictures: Vec<Picture>,

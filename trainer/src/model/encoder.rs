@@ -1,6 +1,7 @@
 //! Images to features to embeddings.
 
 use candle_core::{Result, Tensor};
+use rcwm_models::settings::ModelSettings;
 
 use super::init::Init;
 use super::layers::{NORM_EPS, Norm};
@@ -16,6 +17,14 @@ pub use crate::ops::image_to_float;
 #[derive(Debug, Clone)]
 pub struct ConvStack {
     layers: Vec<(Tensor, Norm)>,
+}
+
+/// Channels of the branches' own convolutions, from the shared features' 2c down to 4 x 4 pixels: one step more for images of 128.
+pub fn branch_channels(settings: &ModelSettings) -> Vec<usize> {
+    let c = settings.cnn_depth;
+    let mut channels = vec![4 * c; settings.stages() - 1];
+    channels[0] = 2 * c;
+    channels
 }
 
 impl ConvStack {

@@ -9,6 +9,7 @@
 //! | d | width of the deterministic state h |
 //! | c | cnn depth: channels after the first convolution |
 //! | E | width of an image's embedding |
+//! | S, C | side of an image, cameras |
 //! | k | rows the interaction model makes of the robot's h, d / m |
 //!
 //! Equation numbers are the paper's. Superscript R is the robot, E the environment. The first action of a pair `(a_{t-1}, o_t)` is the
@@ -19,6 +20,7 @@
 //! | `parameters`, `init` | named parameters, where they come from, how they start |
 //! | `layers` | linear, dense block, two-layer perceptron |
 //! | `encoder`, `decoder` | images in, images and masks out |
+//! | `measured` | what the robot measures of itself, in and out |
 //! | `branch` | recurrent cell, prior, posterior, initial state: robot and environment alike |
 //! | `interaction` | what the robot does to the environment |
 //! | `latent` | states, beginnings of episodes, sampling |
@@ -35,6 +37,7 @@ pub mod init;
 pub mod interaction;
 pub mod latent;
 pub mod layers;
+pub mod measured;
 pub mod parameters;
 pub mod rcwm;
 pub mod vanilla;

@@ -6,9 +6,10 @@ use rcwm_models::settings::ModelSettings;
 use super::batch::{Decoded, Observed, at_step, normalised_action, sequence};
 use super::branch::Branch;
 use super::decoder::Decoder;
-use super::encoder::{ConvStack, flatten_channels_first, image_to_float};
+use super::encoder::{ConvStack, branch_channels, flatten_channels_first, image_to_float};
 use super::interaction::Interaction;
 use super::latent::{FirstSteps, Latent, Sampler, State};
+use super::measured::Measured;
 use super::parameters::{Built, Scope};
 
 /// Index of the robot in a [`State`].
@@ -29,6 +30,8 @@ pub struct Rcwm {
     pub interaction: Interaction,
     /// Each branch's picture.
     pub decoders: [Decoder; 2],
+    /// The robot's measured state, where the model looks at it.
+    pub measured: Option<Measured>,
 }
 
 impl Rcwm {
@@ -36,30 +39,46 @@ impl Rcwm {
     pub fn new(scope: &Scope<'_>, settings: &ModelSettings) -> Built<Self> {
         let (c, nm) = (settings.cnn_depth, settings.stoch_width());
         let encoder = scope.at("encoder");
-        let own = |name| ConvStack::new(&encoder.at(name), &[2 * c, 4 * c, 4 * c]);
-        let branch = |name, input| Branch::new(&scope.at(name), settings, input, 16 * 4 * c);
-        let decoder = |name| Decoder::new(&scope.at("decoder").at(name), settings.branch_width(), c);
+        let channels = branch_channels(settings);
+        let own = |name| ConvStack::new(&encoder.at(name), &channels);
+        let embed = 16 * 4 * c;
+        let branch = |name, input, embed| Branch::new(&scope.at(name), settings, input, embed);
+        let decoder = |name| Decoder::new(&scope.at("decoder").at(name), settings);
         Ok(Self {
-            shared_encoder: ConvStack::new(&encoder.at("shared"), &[3, c, 2 * c])?,
+            shared_encoder: ConvStack::new(&encoder.at("shared"), &[settings.image_channels(), c, 2 * c])?,
             encoders: [own("robot")?, own("environment")?],
-            branches: [branch("robot", nm + settings.action)?, branch("environment", nm)?],
+            branches: [
+                branch("robot", nm + settings.action, embed + Measured::width(settings))?,
+                branch("environment", nm, embed)?,
+            ],
             interaction: Interaction::new(&scope.at("interaction"), settings)?,
             decoders: [decoder("robot")?, decoder("environment")?],
+            measured: Measured::new(scope, settings)?,
         })
     }
 
-    /// Embeddings of u8 images [N, 64, 64, 3], robot's and environment's: [N, 16*4c] each.
-    pub fn encode(&self, images: &Tensor) -> Result<Vec<Tensor>> {
+    /// Embeddings of u8 images [N, S, S, 3 C], robot's and environment's: [N, 16*4c] each, the robot's with what it measured
+    /// [N, state], [N, 16*4c + hidden].
+    pub fn encode(&self, images: &Tensor, state: Option<&Tensor>) -> Result<Vec<Tensor>> {
         let features = self.features(images)?;
-        (0..2).map(|branch| self.embed(branch, &features)).collect()
+        Ok(vec![self.embed_robot(&features, state)?, self.embed(ENVIRONMENT, &features)?])
     }
 
-    /// Features of u8 images [N, 64, 64, 3] that both branches see: [N, 16, 16, 2c].
+    /// The robot's embedding of features [N, S/4, S/4, 2c] and of what it measured [N, state].
+    pub fn embed_robot(&self, features: &Tensor, state: Option<&Tensor>) -> Result<Tensor> {
+        let embed = self.embed(ROBOT, features)?;
+        match &self.measured {
+            Some(measured) => measured.join(&embed, state),
+            None => Ok(embed),
+        }
+    }
+
+    /// Features of u8 images [N, S, S, 3 C] that both branches see: [N, S/4, S/4, 2c].
     pub fn features(&self, images: &Tensor) -> Result<Tensor> {
         self.shared_encoder.forward(&image_to_float(images)?)
     }
 
-    /// One branch's embedding [N, 16*4c] of features [N, 16, 16, 2c].
+    /// A branch's embedding [N, 16*4c] of features [N, S/4, S/4, 2c].
     pub fn embed(&self, branch: usize, features: &Tensor) -> Result<Tensor> {
         flatten_channels_first(&self.encoders[branch].forward(features)?)
     }

@@ -5,9 +5,10 @@ use rcwm_models::settings::ModelSettings;
 
 use super::batch::{Decoded, Observed, at_step, normalised_action, sequence};
 use super::branch::Branch;
-use super::decoder::Decoder;
+use super::decoder::{Decoder, decoder_channels};
 use super::encoder::{ConvStack, flatten_channels_first, image_to_float};
 use super::latent::{FirstSteps, Latent, Sampler, State};
+use super::measured::Measured;
 use super::parameters::{Built, Scope};
 
 /// Encoder, one branch, decoder.
@@ -18,22 +19,38 @@ pub struct Vanilla {
     pub branch: Branch,
     /// Its picture.
     pub decoder: Decoder,
+    /// The robot's measured state, where the model looks at it.
+    pub measured: Option<Measured>,
 }
 
 impl Vanilla {
     /// Parts `encoder.*`, `dynamics.*`, `decoder.*`.
     pub fn new(scope: &Scope<'_>, settings: &ModelSettings) -> Built<Self> {
         let (c, input) = (settings.cnn_depth, settings.stoch_width() + settings.action);
+        // The decoder's, from the other end.
+        let channels: Vec<_> = std::iter::once(settings.image_channels())
+            .chain(decoder_channels(settings).into_iter().rev())
+            .collect();
         Ok(Self {
-            encoder: ConvStack::new(&scope.at("encoder"), &[3, c, 2 * c, 4 * c, 8 * c])?,
-            branch: Branch::new(&scope.at("dynamics"), settings, input, 16 * 8 * c)?,
-            decoder: Decoder::new(&scope.at("decoder"), settings.branch_width(), c)?,
+            encoder: ConvStack::new(&scope.at("encoder"), &channels)?,
+            branch: Branch::new(
+                &scope.at("dynamics"),
+                settings,
+                input,
+                16 * 8 * c + Measured::width(settings),
+            )?,
+            decoder: Decoder::new(&scope.at("decoder"), settings)?,
+            measured: Measured::new(scope, settings)?,
         })
     }
 
-    /// The embedding [N, 16*8c] of u8 images [N, 64, 64, 3].
-    pub fn encode(&self, images: &Tensor) -> Result<Vec<Tensor>> {
-        Ok(vec![flatten_channels_first(&self.encoder.forward(&image_to_float(images)?)?)?])
+    /// The embedding [N, 16*8c] of u8 images [N, S, S, 3 C], with what the robot measured [N, state] [N, 16*8c + hidden].
+    pub fn encode(&self, images: &Tensor, state: Option<&Tensor>) -> Result<Vec<Tensor>> {
+        let embed = flatten_channels_first(&self.encoder.forward(&image_to_float(images)?)?)?;
+        Ok(vec![match &self.measured {
+            Some(measured) => measured.join(&embed, state)?,
+            None => embed,
+        }])
     }
 
     /// The learned state an episode starts from.

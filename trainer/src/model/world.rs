@@ -28,13 +28,15 @@ impl World {
         })
     }
 
-    /// Embeddings of u8 images [B, T, 64, 64, 3], one per branch: [B, T, E].
-    pub fn encode(&self, images: &Tensor) -> Result<Vec<Tensor>> {
+    /// Embeddings of u8 images [B, T, S, S, 3 C] and, where the model looks at it, of the robot's measured state [B, T, state], one per
+    /// branch: [B, T, E].
+    pub fn encode(&self, images: &Tensor, state: Option<&Tensor>) -> Result<Vec<Tensor>> {
         let (batch, length) = (images.dim(0)?, images.dim(1)?);
-        let images = images.flatten(0, 1)?; // [B*T, 64, 64, 3]
+        let images = images.flatten(0, 1)?; // [B*T, S, S, 3 C]
+        let state = state.map(|state| state.flatten(0, 1)).transpose()?; // [B*T, state]
         let embeds = match self {
-            Self::Rcwm(model) => model.encode(&images)?,
-            Self::Vanilla(model) => model.encode(&images)?,
+            Self::Rcwm(model) => model.encode(&images, state.as_ref())?,
+            Self::Vanilla(model) => model.encode(&images, state.as_ref())?,
         };
         embeds.iter().map(|embed| embed.reshape((batch, length, ()))).collect()
     }
@@ -101,7 +103,8 @@ impl World {
     }
 
     /// Squared errors of a state's picture, [N], and of the robot's mask if the true one is given: [`ops::picture_loss`] of
-    /// [`World::decode`], at a fraction of its cost. `images` are u8 [..., 64, 64, 3], `masks` [..., 64, 64] of 0 and 1.
+    /// [`World::decode`], at a fraction of its cost. `images` are u8 [..., S, S, 3 C], `masks` [..., S, S, C] of 0 and 1. The
+    /// cameras of a pixel count as pixels side by side, each with a mask of its own.
     pub fn picture_loss(
         &self,
         state: &State,
@@ -117,9 +120,25 @@ impl World {
             .map(|(decoder, latent)| Ok((decoder.first_map(&latent.features()?)?, decoder.layers())))
             .collect::<Result<Vec<_>>>()?;
         let stacks: Vec<_> = maps.iter().map(|(map, layers)| (map, layers.as_slice())).collect();
-        let images = images.reshape(((), 64, 64, 3))?;
-        let masks = masks.map(|masks| masks.reshape(((), 64, 64))).transpose()?;
+        let [.., side, _, channels] = *images.dims() else {
+            candle_core::bail!("no images: {:?}", images.dims())
+        };
+        let columns = side * channels / 3;
+        let images = images.reshape(((), side, columns, 3))?;
+        let masks = masks.map(|masks| masks.reshape(((), side, columns))).transpose()?;
         ops::reconstruction_loss(&stacks, &images, masks.as_ref())
+    }
+
+    /// Error [B, T] of what the robot's latent state alone says of its measured state [B, T, state], in symlog space; none in a model that
+    /// does not look at it.
+    pub fn state_loss(&self, posteriors: &State, state: Option<&Tensor>) -> Result<Option<Tensor>> {
+        let measured = match self {
+            Self::Rcwm(model) => &model.measured,
+            Self::Vanilla(model) => &model.measured,
+        };
+        // The robot's latent state is the first, and of the baseline the only one.
+        let pair = measured.as_ref().zip(state);
+        pair.map(|(measured, state)| measured.loss(&posteriors.branches[0].features()?, state)).transpose()
     }
 
     /// The pictures of a state [..., ...].

@@ -327,6 +327,40 @@ fn the_reconstruction_loss_is_that_of_the_decoded_pictures() {
     );
 }
 
+/// As the encoder and the decoders of a model of two cameras of 128 x 128 have them.
+#[test]
+fn six_channels_of_128_equal_their_composites_forward_and_backward() {
+    let plain = |x: &[Tensor], op: fn(&Tensor, &Tensor) -> Result<Tensor>| {
+        stack_layers(x).iter().try_fold(x[0].clone(), |y, layer| {
+            let y = op(&y, layer.weight)?;
+            match (layer.norm, layer.bias) {
+                (Some((gain, shift, eps)), _) => composite::layer_norm_silu(&y, gain, shift, eps),
+                (_, Some(bias)) => y.broadcast_add(bias),
+                _ => Ok(y),
+            }
+        })
+    };
+    agree(
+        &stack_inputs(true, 2, 128, [6, 4, 8, 16], false),
+        |x| one(conv_down_stack(&x[0], &stack_layers(x))),
+        |x| one(plain(x, composite::conv_down)),
+    );
+    let bytes: Vec<u8> = (0..2 * 128 * 128 * 6).map(|i| (i * 91 % 256) as u8).collect();
+    let image = Tensor::from_vec(bytes, (2, 128, 256, 3), &Device::Cpu).unwrap();
+    let mask = uniform(&[2, 128, 256], 5, 0.0, 1.0);
+    let inputs = stack_inputs(false, 2, 16, [6, 8, 4, 8], true);
+    let all =
+        |(loss, mask_loss): (Tensor, Option<Tensor>)| [vec![loss], mask_loss.into_iter().collect()].concat();
+    agree(
+        &inputs,
+        |x| reconstruction_loss(&[(&x[0], &stack_layers(x))], &image, Some(&mask)).map(all),
+        |x| {
+            let raw = plain(x, composite::conv_up)?.reshape((2, 128, 256, 4))?;
+            composite::picture_loss(&[&raw], &image, Some(&mask)).map(all)
+        },
+    );
+}
+
 #[test]
 fn images_without_gradient_cost_none_and_change_nothing() {
     let inputs = stack_inputs(true, 2, 8, [3, 4, 4, 4], false);

@@ -29,7 +29,7 @@ impl<'a> Forward<'a> {
         let parameters = parameters(reference, device)?;
         let agent = Agent::new(&parameters.frozen(), &reference.settings)?;
         let Batch { image, action: actions, first, .. } = batch(reference, device)?;
-        let embeds = agent.world.encode(&image)?;
+        let embeds = agent.world.encode(&image, None)?;
         let observed = agent.world.observe(&embeds, &actions, &first, &mut Sampler::Mode)?;
         Ok(Self { reference, agent, embeds, actions, observed })
     }
@@ -141,6 +141,7 @@ pub(super) fn batch(reference: &Reference, device: &Device) -> Result<Batch, Par
         seen: None,
         image: input("image")?,
         action: input("action")?,
+        state: None,
         reward: input("reward")?,
         terminal: input("is_terminal")?,
         first: FirstSteps::new(first.into_iter().map(|flag| flag != 0.0).collect(), reference.length),

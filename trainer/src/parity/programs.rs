@@ -1,6 +1,5 @@
 use candle_core::{DType, Device, Tensor};
 use rcwm_gpu::weights::{Array, Group as Trained};
-use rcwm_models::ACTION_LEN;
 
 use super::forward::{Named, behaviour_settings, parameters};
 use super::updates::unresolved;
@@ -144,10 +143,10 @@ fn host_batch(reference: &Reference) -> Result<HostBatch, ParityError> {
     };
     let steps = reference.batch * reference.length;
     let action = floats("action")?;
-    debug_assert_eq!(action.len(), steps * ACTION_LEN);
     Ok(HostBatch {
         rows: reference.batch,
         length: reference.length,
+        side: reference.settings.image_side,
         image: bytes("image")?,
         masks: true,
         action,

@@ -3,9 +3,8 @@ use std::path::Path;
 
 use candle_core::{DType, Device, Tensor};
 use rcwm_models::files::{FileError, read_capped};
-use rcwm_models::settings::{ModelKind, ModelSettings, SettingsError};
+use rcwm_models::settings::{ModelKind, ModelSettings, Preset, SettingsError};
 use rcwm_models::tensors::{Tensors, TensorsError, Values};
-use rcwm_models::{IMAGE_CHANNELS, IMAGE_SIDE};
 use safetensors::SafeTensors;
 
 /// Largest reference file accepted, in bytes.
@@ -88,12 +87,13 @@ impl Reference {
             bins: width("weights/heads.reward.out.weight", 0)?,
             action: width("input/action", 2)?,
             unimix: 0.01,
+            ..ModelSettings::preset(Preset::Paper, ModelKind::Rcwm)
         };
         settings.validate()?;
         let (batch, length, horizon) = (size("batch")?, size("length")?, size("horizon")?);
-        let action = settings.action;
+        let (action, side) = (settings.action, settings.image_side);
         for (name, shape) in [
-            ("input/image", vec![batch, length, IMAGE_SIDE, IMAGE_SIDE, IMAGE_CHANNELS]),
+            ("input/image", vec![batch, length, side, side, settings.image_channels()]),
             ("input/action", vec![batch, length, action]),
             ("input/is_first", vec![batch, length]),
         ] {

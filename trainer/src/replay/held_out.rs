@@ -15,7 +15,7 @@ impl Replay {
                 held_out.tasks.insert(name.clone(), taken);
             }
         }
-        held_out.next_number = self.next_number;
+        (held_out.next_number, held_out.model) = (self.next_number, self.model.clone());
         (self, held_out)
     }
 }

@@ -2,6 +2,7 @@ use std::fmt::Write as _;
 use std::io;
 use std::path::{Path, PathBuf};
 
+use ndarray::Axis;
 use rcwm_models::episode::{EPISODE_BYTES_MAX, Episode};
 use rcwm_models::files::{read_capped, sha256_hex};
 
@@ -182,15 +183,18 @@ impl Folder {
         if let Some(masks) = &self.masks {
             let folder = masks_of(masks, task, path);
             if folder.is_dir() {
-                episode.robot_mask = Some(read_masks(&folder, episode.len())?);
+                if episode.image.len_of(Axis(3)) > 3 {
+                    let reason = "masks of one camera, the episode has several; store `robot_mask`, `robot_mask_2` in it";
+                    return Err(LoadError::Mask { path: folder, reason: reason.to_owned() });
+                }
+                episode.robot_mask = Some(read_masks(&folder, episode.len(), episode.side())?);
             }
         }
         Ok(episode)
     }
 
-    /// Reads every episode into a replay of this capacity in steps; `seen` hears of each.
-    pub fn load(&self, capacity: usize, mut seen: impl FnMut()) -> Result<Replay, LoadError> {
-        let mut replay = Replay::new(capacity);
+    /// Reads every episode into a replay; `seen` hears of each.
+    pub fn load(&self, mut replay: Replay, mut seen: impl FnMut()) -> Result<Replay, LoadError> {
         for read in self.episodes() {
             let (task, path, episode) = read?;
             let refused = |source| LoadError::Refused { path: path.to_path_buf(), source };
@@ -256,7 +260,7 @@ mod tests {
         }
         let listed = Folder::list(folder.path(), None).unwrap();
         let mut seen = 0;
-        let replay = listed.load(100, || seen += 1).unwrap();
+        let replay = listed.load(Replay::new(100), || seen += 1).unwrap();
         let found: Vec<_> = replay
             .tasks()
             .map(|(name, episodes)| (name, episodes.iter().map(|e| e.reward[0]).collect::<Vec<_>>()))
@@ -277,7 +281,7 @@ mod tests {
         let mut picture = image::GrayImage::new(64, 64);
         picture.put_pixel(5, 3, image::Luma([255]));
         picture.save(pictures.join("00000.png")).unwrap();
-        let load = || Folder::list(&data, Some(&masks)).unwrap().load(10, || ());
+        let load = || Folder::list(&data, Some(&masks)).unwrap().load(Replay::new(10), || ());
         assert!(matches!(load(), Err(LoadError::MaskCount { found: 1, expected: 2, .. })));
         image::GrayImage::new(64, 64).save(pictures.join("00001.png")).unwrap();
         let replay = load().unwrap();
@@ -304,7 +308,7 @@ mod tests {
     }
 
     fn rewards(folder: &Path) -> Vec<(String, Vec<f32>)> {
-        let replay = Folder::list(folder, None).unwrap().load(1000, || ()).unwrap();
+        let replay = Folder::list(folder, None).unwrap().load(Replay::new(1000), || ()).unwrap();
         let of = |(name, episodes): (&str, Vec<&std::sync::Arc<Episode>>)| {
             (name.to_owned(), episodes.iter().map(|episode| episode.reward[0]).collect())
         };

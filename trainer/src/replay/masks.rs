@@ -5,7 +5,6 @@ use std::path::{Path, PathBuf};
 
 use ndarray::Array3;
 use png::{BitDepth, ColorType, Transformations};
-use rcwm_models::IMAGE_SIDE;
 use rcwm_models::episode::robot_above;
 use rcwm_models::files::open_capped;
 
@@ -31,13 +30,14 @@ struct Picture {
 ///
 /// # Errors
 /// [`LoadError::MaskCount`] or [`LoadError::Mask`].
-pub(super) fn read_masks(folder: &Path, steps: usize) -> Result<Array3<bool>, LoadError> {
+pub(super) fn read_masks(folder: &Path, steps: usize, side: usize) -> Result<Array3<bool>, LoadError> {
     let pictures = in_order(folder)?;
     if pictures.len() != steps {
         let (path, found) = (folder.to_path_buf(), pictures.len());
         return Err(LoadError::MaskCount { path, found, expected: steps });
     }
-    let read = |path: &PathBuf| decode(path).map_err(|reason| LoadError::Mask { path: path.clone(), reason });
+    let read =
+        |path: &PathBuf| decode(path, side).map_err(|reason| LoadError::Mask { path: path.clone(), reason });
     let pictures = pictures.iter().map(read).collect::<Result<Vec<_>, _>>()?;
     let robot = robot(&pictures).map_err(|reason| LoadError::Mask { path: folder.to_path_buf(), reason })?;
     if !robot.contains(&true) {
@@ -45,7 +45,7 @@ pub(super) fn read_masks(folder: &Path, steps: usize) -> Result<Array3<bool>, Lo
             "no pixel of all pictures is the robot; expected white, or the number of an object, where it is";
         return Err(LoadError::Mask { path: folder.to_path_buf(), reason: reason.into() });
     }
-    let shape = (steps, IMAGE_SIDE, IMAGE_SIDE);
+    let shape = (steps, side, side);
     Ok(Array3::from_shape_vec(shape, robot).expect("every picture has the size that was asked for"))
 }
 
@@ -131,25 +131,24 @@ fn digits(path: &Path) -> Vec<u64> {
 }
 
 /// Reads a picture as it is stored: a palette's indices stay what they are.
-fn decode(path: &Path) -> Result<Picture, String> {
+fn decode(path: &Path, side: usize) -> Result<Picture, String> {
     let (file, _) = open_capped(path, MASK_BYTES_MAX).map_err(|error| error.to_string())?;
     let mut decoder = png::Decoder::new(BufReader::new(file));
     decoder.set_transformations(Transformations::IDENTITY);
     let mut reader = decoder.read_info().map_err(|error| error.to_string())?;
     let info = reader.info();
-    let side = IMAGE_SIDE as u32;
-    if (info.width, info.height) != (side, side) {
+    if (info.width as usize, info.height as usize) != (side, side) {
         return Err(format!("is {}x{} pixels, expected {side}x{side}", info.width, info.height));
     }
     let bytes = reader.output_buffer_size().ok_or("is larger than memory")?;
     let mut buffer = vec![0; bytes];
     let frame = reader.next_frame(&mut buffer).map_err(|error| error.to_string())?;
     let samples = frame.color_type.samples();
-    let mut values = Vec::with_capacity(IMAGE_SIDE * IMAGE_SIDE);
+    let mut values = Vec::with_capacity(side * side);
     let mut opacity = Vec::new();
     for row in buffer[..frame.buffer_size()].chunks_exact(frame.line_size) {
         let row = unpack(row, frame.bit_depth);
-        for pixel in row.chunks_exact(samples).take(IMAGE_SIDE) {
+        for pixel in row.chunks_exact(samples).take(side) {
             let (colours, alpha) = match frame.color_type {
                 ColorType::GrayscaleAlpha | ColorType::Rgba => pixel.split_at(samples - 1),
                 _ => (pixel, &[][..]),
@@ -189,7 +188,8 @@ mod tests {
     use super::*;
     use std::fs::File;
 
-    const PIXELS: usize = IMAGE_SIDE * IMAGE_SIDE;
+    const SIDE: usize = 64;
+    const PIXELS: usize = SIDE * SIDE;
 
     fn is_robot(pixel: usize) -> bool {
         pixel % 7 < 2
@@ -197,7 +197,7 @@ mod tests {
 
     /// A picture with these samples a pixel where the robot is, and those where it is not.
     fn write(path: &Path, colour: ColorType, depth: BitDepth, robot: &[u8], rest: &[u8]) {
-        let side = IMAGE_SIDE as u32;
+        let side = SIDE as u32;
         let mut encoder = png::Encoder::new(File::create(path).unwrap(), side, side);
         encoder.set_color(colour);
         encoder.set_depth(depth);
@@ -219,7 +219,7 @@ mod tests {
         for step in 0..2 {
             write(&folder.path().join(format!("{step}.png")), colour, depth, robot, rest);
         }
-        read_masks(folder.path(), 2)
+        read_masks(folder.path(), 2, SIDE)
     }
 
     #[test]
@@ -257,7 +257,7 @@ mod tests {
         let mut encoder = png::Encoder::new(File::create(&path).unwrap(), 64, 64);
         encoder.set_depth(BitDepth::One);
         encoder.write_header().unwrap().write_image_data(&[0b0100_0000; 512]).unwrap();
-        let masks = read_masks(folder.path(), 1).unwrap();
+        let masks = read_masks(folder.path(), 1, SIDE).unwrap();
         assert!(masks[[0, 0, 1]] && !masks[[0, 0, 0]]);
         assert_eq!(masks.iter().filter(|robot| **robot).count(), 512);
     }
@@ -275,7 +275,7 @@ mod tests {
             &[0, 255],
         );
         write(&folder.path().join("1.png"), ColorType::GrayscaleAlpha, BitDepth::Eight, &[255, 0], &[0, 255]);
-        let error = read_masks(folder.path(), 2).unwrap_err().to_string();
+        let error = read_masks(folder.path(), 2, SIDE).unwrap_err().to_string();
         assert!(error.contains("two different masks"), "{error}");
     }
 

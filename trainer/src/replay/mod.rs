@@ -11,6 +11,7 @@
 //! masks/reach/000017/00000.png, 00001.png, ...   optional: masks that a segmenter wrote, one a step: white, or the number of an object
 //! ```
 
+mod error;
 mod folder;
 mod held_out;
 mod load;
@@ -19,9 +20,10 @@ mod prefetch;
 mod shared;
 mod store;
 
+pub use error::ReplayError;
 pub use folder::LoadError;
 pub use load::Folder;
 pub use prefetch::{Prefetch, PrefetchError};
 pub use shared::SharedReplay;
 pub(crate) use store::check_episode;
-pub use store::{Placed, Replay, ReplayError, Starts, append_steps};
+pub use store::{Placed, Replay, Starts, append_steps};

@@ -5,44 +5,11 @@ use ndarray::Axis;
 use rand::{Rng, SeedableRng};
 use rand_chacha::ChaCha8Rng;
 use rcwm_models::episode::Episode;
+use rcwm_models::settings::ModelSettings;
 use serde::{Deserialize, Serialize};
 
+use super::ReplayError;
 use crate::learning::{HostBatch, Look, LookSettings};
-
-/// Why an episode was refused or a batch could not be drawn.
-#[derive(Debug, thiserror::Error)]
-pub enum ReplayError {
-    /// It holds no steps.
-    #[error("an episode of {task} holds no steps")]
-    Empty { task: String },
-    /// An action or a reward is NaN or infinite.
-    #[error("an episode of {task} holds a {what} at step {step} that is not finite; leave the episode out")]
-    NotFinite {
-        task: String,
-        what: &'static str,
-        /// Where.
-        step: usize,
-    },
-    /// It does not fit.
-    #[error(
-        "an episode of {task} has {steps} steps, the replay holds at most {capacity}; set replay.capacity_steps higher"
-    )]
-    TooLong {
-        task: String,
-        steps: usize,
-        /// The replay's capacity in steps.
-        capacity: usize,
-    },
-    /// There is nothing to draw from.
-    #[error("the replay holds no {}; collect some first", if *masks { "episode with robot masks" } else { "episode" })]
-    NothingToDraw {
-        /// Whether masks were asked for.
-        masks: bool,
-    },
-    /// Masks are asked for and an episode in the sequence has none.
-    #[error("an episode of {task} has no robot masks; draw from the masked episodes only")]
-    NoMasks { task: String },
-}
 
 /// Where sequences begin.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default, Serialize, Deserialize)]
@@ -97,13 +64,28 @@ pub struct Replay {
     pub(super) steps: usize,
     pub(super) next_number: u64,
     look: LookSettings,
+    /// Whose sizes every episode must have.
+    pub(super) model: Option<ModelSettings>,
 }
 
 impl Replay {
     /// An empty replay that holds at most `capacity` steps.
     #[must_use]
     pub fn new(capacity: usize) -> Self {
-        Self { tasks: BTreeMap::new(), capacity, steps: 0, next_number: 0, look: LookSettings::default() }
+        Self {
+            tasks: BTreeMap::new(),
+            capacity,
+            steps: 0,
+            next_number: 0,
+            look: LookSettings::default(),
+            model: None,
+        }
+    }
+
+    /// Refuses episodes of other sizes than this model's from now on, and draws the robot's measured state if it looks at one.
+    #[must_use]
+    pub fn fitting(self, model: &ModelSettings) -> Self {
+        Self { model: Some(model.clone()), ..self }
     }
 
     /// Has the encoders see what is drawn from now on as these settings say.
@@ -137,6 +119,9 @@ impl Replay {
     pub fn add(&mut self, task: &str, episode: impl Into<Arc<Episode>>) -> Result<(), ReplayError> {
         let episode = episode.into();
         check_episode(task, &episode)?;
+        if let Some(misfit) = self.model.as_ref().and_then(|model| episode.misfit(model)) {
+            return Err(ReplayError::Misfit { task: task.to_owned(), misfit });
+        }
         let steps = episode.len();
         if steps > self.capacity {
             return Err(ReplayError::TooLong { task: task.to_owned(), steps, capacity: self.capacity });
@@ -187,7 +172,7 @@ impl Replay {
     #[must_use]
     pub fn masked(&self) -> Self {
         let mut masked = Self::new(self.capacity);
-        (masked.next_number, masked.look) = (self.next_number, self.look);
+        (masked.next_number, masked.look, masked.model) = (self.next_number, self.look, self.model.clone());
         for (name, task) in &self.tasks {
             let with_mask = |stored: &&Stored| stored.episode.robot_mask.is_some();
             let episodes: VecDeque<_> = task.episodes.iter().filter(with_mask).cloned().collect();
@@ -233,7 +218,8 @@ impl Replay {
         }
         let mut generator = ChaCha8Rng::seed_from_u64(seed);
         generator.set_stream(number);
-        let mut batch = HostBatch { rows, length, number, masks, ..HostBatch::default() };
+        let states = self.model.as_ref().is_some_and(|model| model.state > 0);
+        let mut batch = HostBatch { rows, length, number, masks, states, ..HostBatch::default() };
         let tasks: Vec<_> = self.tasks.iter().collect();
         // The turn goes on from batch to batch, so that shares are equal also where they do not divide a batch.
         let turn = (number % tasks.len() as u64) as usize * (rows % tasks.len());
@@ -349,7 +335,11 @@ fn masks_of<'a>(name: &str, episode: &'a Episode) -> Result<&'a ndarray::Array3<
 /// Everything of some steps but their pictures.
 fn append_facts(episode: &Episode, from: usize, count: usize, batch: &mut HostBatch) {
     let range = ndarray::Slice::from(from..from + count);
+    batch.side = episode.side();
     batch.action.extend(episode.action.slice_axis(Axis(0), range));
+    if let Some(state) = episode.proprio.as_ref().filter(|_| batch.states) {
+        batch.state.extend(state.slice_axis(Axis(0), range));
+    }
     batch.reward.extend(episode.reward.slice_axis(Axis(0), range));
     batch.terminal.extend(episode.is_terminal.slice_axis(Axis(0), range));
     // What a file does not say of its first step is true all the same: nothing came before it.

@@ -2,7 +2,6 @@ use std::path::{Path, PathBuf};
 use std::sync::atomic::AtomicBool;
 
 use image::RgbImage;
-use rcwm_models::IMAGE_SIDE;
 use rcwm_models::bundle::{Bundle, MANIFEST_BYTES_MAX, MANIFEST_FILE, Provenance};
 use rcwm_models::episode::Episode;
 use rcwm_models::files::{read_capped, sha256_hex};
@@ -318,7 +317,7 @@ fn tick(runtimes: &[serde_json::Value]) -> Option<Tick> {
 /// What the camera saw, up to a little after the task was solved.
 fn frames(episode: &Episode, solved_at: Option<usize>) -> Vec<RgbImage> {
     let end = solved_at.map_or(episode.len(), |step| (step + FILM_AFTER).min(episode.len()));
-    let side = IMAGE_SIDE as u32;
+    let side = episode.side() as u32;
     let frame = |step: usize| {
         let image = episode.image.index_axis(ndarray::Axis(0), step);
         RgbImage::from_fn(side, side, |x, y| {

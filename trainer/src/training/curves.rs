@@ -44,6 +44,7 @@ struct Losses {
     total: Option<f64>,
     image: Option<f64>,
     robot_mask: Option<f64>,
+    state_loss: Option<f64>,
     reward: Option<f64>,
     robot_kl: Option<f64>,
     environment_kl: Option<f64>,
@@ -53,12 +54,14 @@ struct Losses {
 type OfLosses = fn(&Losses) -> Option<f64>;
 
 const MASK: &str = "robot mask, squared error summed";
+const STATE: &str = "measured state, squared error of symlog summed";
 const CLONING: &str = "cloning, squared error summed";
 
-const LOSSES: [(&str, OfLosses); 7] = [
+const LOSSES: [(&str, OfLosses); 8] = [
     ("total loss", |losses| losses.total),
     ("image, squared error summed over pixels", |losses| losses.image),
     (MASK, |losses| losses.robot_mask),
+    (STATE, |losses| losses.state_loss),
     (CLONING, |losses| losses.cloning),
     ("reward, cross-entropy (nats)", |losses| losses.reward),
     ("KL robot (nats)", |losses| losses.robot_kl),
@@ -96,6 +99,9 @@ fn panels(rows: &[Row], warm_up_updates: u64) -> Vec<Panel> {
     let mut panels: Vec<Panel> = LOSSES
         .iter()
         .filter(|(title, _)| *title != if demonstrated { MASK } else { CLONING })
+        .filter(|(title, of)| {
+            *title != STATE || rows.iter().any(|row| row.losses.as_ref().and_then(of).is_some())
+        })
         .map(|(title, of)| {
             let trained = match *title {
                 CLONING => points(rows, clones),

@@ -6,7 +6,7 @@ use super::{FewshotSettings, TrainingError};
 use crate::replay::{Folder, LoadError, Replay};
 
 /// The first demonstrations in the folder of a task's episodes that the settings ask for, in the order of their names: `collect` names
-/// those of the scripted expert so that they come first.
+/// those of the scripted expert so that they come first. They are added to an empty `replay`.
 ///
 /// # Errors
 /// [`TrainingError::NoDemonstrations`] if there is none, or those of reading.
@@ -14,10 +14,9 @@ pub fn demonstrations(
     data: &Path,
     task: &str,
     settings: &FewshotSettings,
-    capacity_steps: usize,
+    mut replay: Replay,
     mut seen: impl FnMut(),
 ) -> Result<Replay, TrainingError> {
-    let mut replay = Replay::new(capacity_steps);
     let mut episodes = 0;
     for read in Folder::list_task(data, task)?.episodes() {
         let (name, path, episode) = read?;

@@ -58,7 +58,8 @@ pub fn film(
 ) -> Result<Film, TrainingError> {
     let length = settings.length.min(episode.len());
     let context = settings.context.clamp(1, length.saturating_sub(1).max(1));
-    let mut batch = HostBatch { rows: 1, length, ..HostBatch::default() };
+    let states = episode.proprio.is_some();
+    let mut batch = HostBatch { rows: 1, length, states, ..HostBatch::default() };
     append_steps("", episode, 0, length, false, &mut batch)?;
     let batch = batch.into_tensors(device)?;
     let states = open_loop(&agent.world, &batch, context, &mut Sampler::Mode)?;

@@ -62,6 +62,7 @@ pub(super) fn mean_losses(losses: &[LossValues]) -> LossValues {
         total: mean(|losses| Some(losses.total)).unwrap_or_default(),
         image: mean(|losses| Some(losses.image)).unwrap_or_default(),
         robot_mask: mean(|losses| losses.robot_mask),
+        state: mean(|losses| losses.state),
         cloning: mean(|losses| losses.cloning),
         reward: mean(|losses| Some(losses.reward)).unwrap_or_default(),
         continues: mean(|losses| Some(losses.continues)).unwrap_or_default(),

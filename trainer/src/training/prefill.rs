@@ -69,7 +69,7 @@ struct Filled<'a> {
 
 impl<'a> Filled<'a> {
     fn new(settings: &'a TrainingSettings) -> Self {
-        let replay = Replay::new(settings.replay.capacity_steps);
+        let replay = Replay::new(settings.replay.capacity_steps).fitting(&settings.model);
         Self { settings, replay, demonstrations: 0, policy_successes: Vec::new() }
     }
 

@@ -38,6 +38,10 @@ pub fn untrained(kind: ModelKind, seed: u64) -> Checkpoint {
     Checkpoint { settings: settings(model), parameters }
 }
 
+pub fn checkpoint(parameters: Parameters, model: ModelSettings) -> Checkpoint {
+    Checkpoint { settings: settings(model), parameters }
+}
+
 fn settings(model: ModelSettings) -> CheckpointSettings {
     CheckpointSettings {
         format: checkpoint::FORMAT,

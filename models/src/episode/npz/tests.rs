@@ -10,7 +10,7 @@ const T: usize = 6;
 impl Foreign {
     fn new() -> Self {
         let mut foreign = Self(Vec::new());
-        foreign.set("image", "|u1", &[T, 64, 64, 3], &vec![9; T * IMAGE_SIDE * IMAGE_SIDE * 3]);
+        foreign.set("image", "|u1", &[T, 64, 64, 3], &vec![9; T * 64 * 64 * 3]);
         let mut action = vec![0.0_f32; 4];
         action.extend((1..T).flat_map(|step| [step as f32 / 10.0; 4]));
         foreign.set(
@@ -70,18 +70,18 @@ fn columns_and_axes_of_one_environment_are_read_as_the_same_numbers() {
     columns.set("reward", ">f8", &[T, 1], &[0; 8 * T]);
     columns.set("is_first", "<i8", &[T, 1, 1], &[&[1_u8][..], &[0; 8 * T - 1]].concat());
     columns.set("is_last", "|u1", &[T, 1], &[0, 0, 0, 0, 0, 255]);
-    columns.set("image", "|u1", &[T, 1, 64, 64, 3], &vec![9; T * IMAGE_SIDE * IMAGE_SIDE * 3]);
+    columns.set("image", "|u1", &[T, 1, 64, 64, 3], &vec![9; T * 64 * 64 * 3]);
     assert_eq!(columns.read().unwrap(), plain);
     let one = vec![0; 4 * T];
     assert!(Foreign::with("reward", "<f4", &[1, T], &one).unwrap_err().contains("[1, 6]"), "not a column");
-    let images = vec![9_u8; T * IMAGE_SIDE * IMAGE_SIDE * 3];
+    let images = vec![9_u8; T * 64 * 64 * 3];
     let whole = images.iter().flat_map(|x| i32::from(*x).to_le_bytes()).collect::<Vec<_>>();
     assert_eq!(Foreign::with("image", "<i4", &[T, 64, 64, 3], &whole).unwrap(), plain);
 }
 
 #[test]
 fn pictures_of_another_form_are_refused_with_what_to_do() {
-    let pixels = T * IMAGE_SIDE * IMAGE_SIDE * 3;
+    let pixels = T * 64 * 64 * 3;
     let error = Foreign::with("image", "<f4", &[T, 64, 64, 3], &vec![0; 4 * pixels]).unwrap_err();
     assert!(error.contains("floating-point") && error.contains("uint8"), "{error}");
     let error = Foreign::with("image", "|u1", &[T, 3, 64, 64], &vec![0; pixels]).unwrap_err();
@@ -93,7 +93,7 @@ fn pictures_of_another_form_are_refused_with_what_to_do() {
 
 #[test]
 fn masks_of_every_convention_are_the_same_mask() {
-    let shape = [T, IMAGE_SIDE, IMAGE_SIDE];
+    let shape = [T, 64, 64];
     let pixels: usize = shape.iter().product();
     let robot = |index: usize| index.is_multiple_of(5);
     let expected: Vec<bool> = (0..pixels).map(robot).collect();
@@ -104,7 +104,7 @@ fn masks_of_every_convention_are_the_same_mask() {
         let episode = Foreign::with("robot_mask", descr, shape, &bytes).unwrap();
         episode.robot_mask.unwrap().into_raw_vec_and_offset().0
     };
-    let with_channel = [T, IMAGE_SIDE, IMAGE_SIDE, 1];
+    let with_channel = [T, 64, 64, 1];
     assert_eq!(masks("|b1", &shape, &[1]), expected);
     assert_eq!(masks("|u1", &shape, &[255]), expected);
     assert_eq!(masks("|u1", &with_channel, &[3]), expected, "the number of an object");
@@ -142,4 +142,21 @@ fn actions_at_the_image_they_were_chosen_on_are_refused_with_the_remedy() {
     chunk.read().unwrap();
     chunk.set("stepid", "|u1", &[T, 20], &[0; 20 * T]);
     assert!(chunk.read().unwrap_err().contains("ends"));
+}
+
+#[test]
+fn a_camera_that_is_missing_or_of_another_size_is_named() {
+    let images = vec![9; T * 64 * 64 * 3];
+    let mut foreign = Foreign::new();
+    foreign.set("image_2", "|u1", &[T, 64, 64, 3], &images);
+    assert_eq!(foreign.read().unwrap().image.shape(), [T, 64, 64, 6]);
+    foreign.set("disturbed_2", "|u1", &[T, 64, 64, 3], &images);
+    assert!(foreign.read().unwrap_err().contains("\"disturbed\" is missing"));
+    let error = Foreign::with("image_2", "|u1", &[T, 128, 128, 3], &[]).unwrap_err();
+    assert!(error.contains("\"image_2\"") && error.contains("[6, 64, 64, 3]"), "{error}");
+    let error = Foreign::with("action", "<f4", &[T, 2, 4], &[]).unwrap_err();
+    assert!(error.contains("[6, 2, 4]") && error.contains("[T, n]"), "{error}");
+    // Large pictures of as many steps as small ones may have would be more than memory holds.
+    let error = Foreign::with("image", "|u1", &[STEPS_MAX, 128, 128, 3], &[]).unwrap_err();
+    assert!(error.contains("bytes of all cameras"), "{error}");
 }

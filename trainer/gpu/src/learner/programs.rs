@@ -92,6 +92,15 @@ pub(super) fn check(settings: &LearnerSettings) -> Result<(), GpuError> {
             "world.decode_every = {decode_every} does not divide replay.length = {length}, as updates on a GPU need"
         ));
     }
+    for (name, found, taken) in
+        [("image_side", model.image_side, 64), ("cameras", model.cameras, 1), ("state", model.state, 0)]
+    {
+        if found != taken {
+            return refuse(format!(
+                "model.{name} = {found}; updates on a GPU take {taken} so far, leave --device out to run on the CPU"
+            ));
+        }
+    }
     if !model.cnn_depth.is_multiple_of(4) {
         return refuse(format!(
             "model.cnn_depth = {}; updates on a GPU take a multiple of 4, or run on the CPU",
