@@ -44,6 +44,7 @@ fn source(part: PartName, input: &str) -> String {
         (PartName::Encoder, _) => own(inputs::IMAGE),
         (PartName::Robot | PartName::Environment, "features") => "encoder/features".into(),
         (PartName::Robot, "action") => own(inputs::ACTION),
+        (PartName::Robot, "state") => own(inputs::STATE),
         (PartName::Robot, "noise") => own(inputs::ROBOT_NOISE),
         (PartName::Robot, "z") => own(inputs::ROBOT_Z),
         (PartName::Robot, _) => own(inputs::ROBOT_H),
@@ -132,7 +133,7 @@ fn add(graph: &mut Graph, part: PartName, model: Model, facts: Vec<(String, Fact
 }
 
 fn mark_late(graph: &mut Graph) {
-    let mut late: BTreeSet<String> = [inputs::IMAGE.to_owned()].into();
+    let mut late: BTreeSet<String> = [inputs::IMAGE, inputs::STATE].map(str::to_owned).into();
     for node in &mut graph.nodes {
         node.late = node.node.input.iter().any(|input| late.contains(input));
         if node.late {

@@ -23,6 +23,8 @@ use rcwm_models::bundle::{Bundle, PartName};
 pub mod inputs {
     /// The image; all that depends on it is late.
     pub const IMAGE: &str = "image";
+    /// The measured state, as late as the image.
+    pub const STATE: &str = "state";
     /// The executed action.
     pub const ACTION: &str = "action";
     /// Gumbel noise of the robot branch.

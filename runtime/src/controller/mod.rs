@@ -47,7 +47,7 @@ use std::time::Duration;
 use rcwm_models::wire::{Action, ControllerLink, ObservationSample, Wait};
 
 use crate::pacing::{Pacing, Plan};
-use crate::policy::Policy;
+use crate::policy::{InputReader, Policy};
 use crate::swap::{Moment, Swapper};
 use crate::telemetry::{Stage, Telemetry};
 use imagined::Imagined;
@@ -67,6 +67,8 @@ pub struct Controller {
     tracker: SequenceTracker,
     pacing: Pacing,
     filter: SafetyFilter,
+    /// What of an observation the policy reads.
+    inputs: InputReader,
     telemetry: Telemetry,
     surprise: SurpriseTelemetry,
     counters: Counters,
@@ -145,6 +147,7 @@ impl Controller {
             tracker: SequenceTracker::default(),
             pacing: Pacing::new(settings.pacing),
             filter,
+            inputs: InputReader::of(&policy.manifest().policy),
             telemetry: Telemetry::new(),
             surprise: SurpriseTelemetry::new(),
             counters: Counters::default(),
@@ -175,6 +178,7 @@ impl Controller {
             && swapper.poll(moment, &mut self.policy)
         {
             self.filter.take_limits(self.policy.limits());
+            self.inputs = InputReader::of(&self.policy.manifest().policy);
             self.imagined.clear();
             self.fresh_policy = true;
             self.counters.swaps += 1;

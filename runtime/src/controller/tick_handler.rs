@@ -149,15 +149,15 @@ impl Controller {
 
     /// The policy's decision, and whether it is fit to be sent.
     fn decide(&mut self, observation: &Observation<'_>, is_first: bool) -> (Option<Decision>, Event) {
-        let camera = self.policy.camera(observation.format().interface());
-        let Some(camera) = camera.filter(|_| observation.is_valid()) else {
+        let inputs = self.inputs.read(observation).filter(|_| observation.is_valid());
+        let Some(inputs) = inputs else {
             self.counters.refused_observations += 1;
             return (None, Event::Invalid(Cause::Observation));
         };
         // A new policy starts where it takes over, as at the first of an episode.
         let is_first = is_first | std::mem::take(&mut self.fresh_policy);
         let executed = observation.executed_action();
-        let decided = self.policy.observe(observation.image(camera), (!is_first).then_some(&executed));
+        let decided = self.policy.observe(inputs, (!is_first).then_some(&executed));
         let decision = match decided {
             Ok(decision) => decision,
             Err(error) => return (None, Event::Invalid(self.count_failure(&error))),

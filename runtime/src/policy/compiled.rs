@@ -17,7 +17,7 @@ use tract_onnx::prelude::TractResult;
 use super::parts::finite;
 use super::stages::StageClock;
 use super::tick::{Tick, Work};
-use super::{Buffers, PolicyError};
+use super::{Buffers, Inputs, PolicyError};
 use crate::compile::{CompileError, Optimizations, compile};
 use crate::engine::{EngineError, weights};
 use crate::operators::SharedTeam;
@@ -161,9 +161,12 @@ impl Tick for Compiled {
         work.buffers.check_priors()
     }
 
-    fn observe(&mut self, image: &[u8], work: &mut Work<'_>) -> Result<(), PolicyError> {
+    fn observe(&mut self, inputs: Inputs<'_>, work: &mut Work<'_>) -> Result<(), PolicyError> {
         let Self { values, places, encoder, .. } = self;
-        let encoded = values.fill(places.image, image).and_then(|()| encoder.run(values));
+        let encoded = values
+            .fill(places.image, inputs.image)
+            .and_then(|()| values.fill(places.state, inputs.state))
+            .and_then(|()| encoder.run(values));
         encoded.map_err(|error| run_error(PartName::Encoder, &error))?;
         work.clock.ended(PartName::Encoder);
         self.branches.run(&mut self.values, work.clock).map_err(|(part, error)| run_error(part, &error))?;

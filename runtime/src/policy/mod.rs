@@ -15,6 +15,7 @@
 mod calls;
 mod compiled;
 mod error;
+mod inputs;
 mod limits;
 mod noise;
 mod parts;
@@ -25,6 +26,7 @@ mod tick;
 
 pub use calls::{CALLS_MAX, Call, CallKind, CallOutcome};
 pub use error::PolicyError;
+pub use inputs::{InputReader, Inputs};
 pub use limits::ActionLimits;
 pub use noise::Sampling;
 pub use parts::{BranchBuffers, Buffers};
@@ -34,7 +36,7 @@ use std::path::{Path, PathBuf};
 use std::time::Instant;
 
 use rcwm_models::bundle::{Bundle, Manifest, PartName};
-use rcwm_models::interface::{Interface, Normaliser};
+use rcwm_models::interface::Normaliser;
 use rcwm_models::wire::ActionValues;
 
 use crate::engine::{EngineSettings, Form};
@@ -135,10 +137,11 @@ impl Policy {
 
     /// Runs some ticks on a black image, so that the first real one finds memory and caches ready.
     fn warm_up(&mut self, sampling: Sampling) -> Result<(), PolicyError> {
-        let image = vec![0; self.image_bytes()];
+        let (image, state) = (vec![0; self.image_bytes()], vec![0.0; self.manifest.model.state]);
+        let inputs = Inputs { image: &image, state: &state };
         let middle = self.limits.clamp(ActionValues::zeros(self.limits.numbers()));
         for tick in 0..3 {
-            match self.observe(&image, (tick > 0).then_some(&middle)) {
+            match self.observe(inputs, (tick > 0).then_some(&middle)) {
                 // Poisoned weights must not stop a controller that has a fallback: they are reported tick by tick.
                 Ok(_) | Err(PolicyError::NotFinite { .. }) => {}
                 Err(error) => return Err(error),
@@ -154,26 +157,25 @@ impl Policy {
 
     /// Decides on one observation and carries the state on.
     ///
-    /// `image` is of the size of the encoder's input, upright, RGB; `executed_action`, in the interface's units, is what was really
+    /// `inputs` are an image of the size of the encoder's input, and the measured state where the bundle reads one; `executed_action`, in the interface's units, is what was really
     /// executed to get here, and none at the first
     /// observation of an episode, which starts from the learned initial state.
     ///
     /// # Errors
     /// [`PolicyError::Observation`], [`PolicyError::Engine`] or [`PolicyError::NotFinite`]; the carried state is then that of
     /// the last good tick.
-    pub fn observe(
+    pub fn observe<'a>(
         &mut self,
-        image: &[u8],
+        inputs: impl Into<Inputs<'a>>,
         executed_action: Option<&ActionValues>,
     ) -> Result<Decision, PolicyError> {
-        let (found, expected) = (image.len(), self.image_bytes());
-        let before = if found == expected {
-            self.before(executed_action)
-        } else {
-            Err(PolicyError::Observation(format!("the image has {found} bytes, expected {expected}")))
+        let inputs = inputs.into();
+        let before = match self.misfit(inputs) {
+            None => self.before(executed_action),
+            Some(text) => Err(PolicyError::Observation(text)),
         };
         self.decide(CallKind::Observe, executed_action, before, |tick, work| {
-            tick.observe(image, work)?;
+            tick.observe(inputs, work)?;
             Ok(Some(work.buffers.surprise()))
         })
     }
@@ -346,11 +348,17 @@ impl Policy {
         self.noise.set(robot, environment)
     }
 
-    /// Which of a robot's cameras the policy sees.
-    #[must_use]
-    pub fn camera(&self, robot: &Interface) -> Option<usize> {
-        let inputs = &self.manifest.policy.inputs;
-        robot.camera.iter().position(|camera| inputs.contains(&camera.name))
+    /// What about the inputs is not of the bundle's sizes, or no number.
+    fn misfit(&self, inputs: Inputs<'_>) -> Option<String> {
+        let (found, expected) = (inputs.image.len(), self.image_bytes());
+        if found != expected {
+            return Some(format!("the image has {found} bytes, expected {expected}"));
+        }
+        let (found, expected) = (inputs.state.len(), self.manifest.model.state);
+        if found != expected {
+            return Some(format!("the state has {found} numbers, expected {expected}"));
+        }
+        inputs.state.iter().any(|x| !x.is_finite()).then(|| "the state holds what is no number".to_owned())
     }
 
     /// Bytes of the encoder's image.

@@ -184,6 +184,7 @@ impl Parts {
         &mut self,
         state: &BranchState,
         action: &ActionValues,
+        measured: &[f32],
         noise: &[f32],
         to: &mut Buffers,
     ) -> Result<(), PolicyError> {
@@ -193,8 +194,11 @@ impl Parts {
             Input::F32(action),
             Input::F32(&to.features),
             Input::F32(noise),
+            Input::F32(measured),
         ];
-        self.robot.run(&inputs, &mut to.robot.outputs())?;
+        // Models without a measured state have no such input.
+        let inputs = &inputs[..if measured.is_empty() { 5 } else { 6 }];
+        self.robot.run(inputs, &mut to.robot.outputs())?;
         to.robot.check(PartName::Robot, to.classes)
     }
 

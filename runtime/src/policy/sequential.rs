@@ -5,28 +5,29 @@
 use rcwm_models::bundle::{Bundle, PartName};
 use rcwm_models::wire::ActionValues;
 
-use super::PolicyError;
 use super::parts::Parts;
 use super::tick::{Tick, Work};
+use super::{Inputs, PolicyError};
 use crate::engine::{EngineError, EngineSettings};
 
 /// The five parts of a tick and the action before it.
 pub(super) struct Sequential {
     parts: Parts,
     action: ActionValues,
+    /// What was measured last.
+    state: Vec<f32>,
 }
 
 impl Sequential {
     pub(super) fn load(bundle: &Bundle, settings: EngineSettings) -> Result<Self, EngineError> {
-        Ok(Self {
-            parts: Parts::load(bundle, settings)?,
-            action: ActionValues::zeros(bundle.manifest.model.action),
-        })
+        let model = &bundle.manifest.model;
+        let (action, state) = (ActionValues::zeros(model.action), vec![0.0; model.state]);
+        Ok(Self { parts: Parts::load(bundle, settings)?, action, state })
     }
 
     fn branches(&mut self, work: &mut Work<'_>) -> Result<(), PolicyError> {
         let Work { state, noise, buffers, clock } = work;
-        self.parts.run_robot(&state.robot, &self.action, noise.robot(), buffers)?;
+        self.parts.run_robot(&state.robot, &self.action, &self.state, noise.robot(), buffers)?;
         clock.ended(PartName::Robot);
         self.parts.run_interaction(&state.environment, buffers)?;
         clock.ended(PartName::Interaction);
@@ -49,8 +50,10 @@ impl Tick for Sequential {
         Ok(())
     }
 
-    fn observe(&mut self, image: &[u8], work: &mut Work<'_>) -> Result<(), PolicyError> {
-        self.parts.run_encoder(image, work.buffers)?;
+    fn observe(&mut self, inputs: Inputs<'_>, work: &mut Work<'_>) -> Result<(), PolicyError> {
+        self.state.clear();
+        self.state.extend_from_slice(inputs.state);
+        self.parts.run_encoder(inputs.image, work.buffers)?;
         work.clock.ended(PartName::Encoder);
         self.branches(work)?;
         self.act(work)

@@ -4,7 +4,7 @@ use rcwm_models::wire::ActionValues;
 
 use super::noise::NoiseSource;
 use super::stages::StageClock;
-use super::{Buffers, PolicyError, State};
+use super::{Buffers, Inputs, PolicyError, State};
 
 /// What a tick works on. What is computed is left in the buffers; the state is the caller's.
 pub(super) struct Work<'a> {
@@ -19,8 +19,8 @@ pub(super) trait Tick: Send {
     /// All that needs only the action.
     fn work_ahead(&mut self, action: &ActionValues, work: &mut Work<'_>) -> Result<(), PolicyError>;
 
-    /// All else, once the image is there: 64 x 64 x 3 bytes.
-    fn observe(&mut self, image: &[u8], work: &mut Work<'_>) -> Result<(), PolicyError>;
+    /// All else, once the inputs are there; they are of the bundle's sizes.
+    fn observe(&mut self, inputs: Inputs<'_>, work: &mut Work<'_>) -> Result<(), PolicyError>;
 
     /// All else without an image: the prior stands in for the posterior.
     fn imagine(&mut self, work: &mut Work<'_>) -> Result<(), PolicyError>;

@@ -7,7 +7,7 @@ use rcwm_models::tensors::{Tensors, TensorsError, Values};
 use rcwm_models::wire::ActionValues;
 
 use super::VerifyError;
-use crate::policy::State;
+use crate::policy::{Inputs, State};
 
 pub(super) const BRANCHES: [PartName; 2] = [PartName::Robot, PartName::Environment];
 
@@ -32,7 +32,9 @@ impl<'a> Golden<'a> {
             this.rows("input/robot_noise", DType::F32, noise_len)?,
             this.rows("input/environment_noise", DType::F32, noise_len)?,
         ];
-        this.ticks = ticks.into_iter().min().unwrap_or(0);
+        let state = bundle.manifest.model.state;
+        let measured = if state == 0 { usize::MAX } else { this.rows("input/state", DType::F32, state)? };
+        this.ticks = ticks.into_iter().chain([measured]).min().unwrap_or(0);
         if this.ticks == 0 {
             return Err(this.wrong(TensorsError::Missing { name: "input/*, at least one tick".into() }));
         }
@@ -113,6 +115,15 @@ impl<'a> Golden<'a> {
 
     pub(super) fn image(&self, tick: usize) -> Result<&'a [u8], VerifyError> {
         self.u8("input/image", tick)
+    }
+
+    /// The measured state; empty where the model reads none.
+    pub(super) fn measured(&self, tick: usize) -> Result<&'a [f32], VerifyError> {
+        if self.bundle.manifest.model.state == 0 { Ok(&[]) } else { self.f32("input/state", tick) }
+    }
+
+    pub(super) fn inputs(&self, tick: usize) -> Result<Inputs<'a>, VerifyError> {
+        Ok(Inputs { image: self.image(tick)?, state: self.measured(tick)? })
     }
 
     pub(super) fn is_first(&self, tick: usize) -> Result<bool, VerifyError> {

@@ -41,9 +41,9 @@ pub fn half_weights(bundle: &Bundle) -> Result<HalfReport, VerifyError> {
     let mut report = HalfReport::default();
     let (mut executed, mut error_sum) = (None::<ActionValues>, 0.0_f64);
     for tick in 0..HALF_TICKS {
-        let image = golden.image(tick % golden.ticks)?;
+        let inputs = golden.inputs(tick % golden.ticks)?;
         let (right, rounded) =
-            (exact.observe(image, executed.as_ref())?, half.observe(image, executed.as_ref())?);
+            (exact.observe(inputs, executed.as_ref())?, half.observe(inputs, executed.as_ref())?);
         for (right, rounded) in right.mean.iter().zip(rounded.mean.iter()) {
             let error = (right - rounded).abs();
             report.action_error_max = report.action_error_max.max(error);

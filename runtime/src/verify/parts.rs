@@ -87,9 +87,16 @@ impl<'a> Checker<'a> {
                 let noise = Input::F32(golden.noise(part, tick)?);
                 let State { robot, .. } = &before;
                 let features = Input::F32(self.features(tick)?);
-                let inputs =
-                    [Input::I64(&robot.z), Input::F32(&robot.h), Input::F32(&action), features, noise];
-                loaded.run(&inputs, &mut outputs)?;
+                let measured = golden.measured(tick)?;
+                let inputs = [
+                    Input::I64(&robot.z),
+                    Input::F32(&robot.h),
+                    Input::F32(&action),
+                    features,
+                    noise,
+                    Input::F32(measured),
+                ];
+                loaded.run(&inputs[..if measured.is_empty() { 5 } else { 6 }], &mut outputs)?;
             }
             PartName::Interaction => {
                 let inputs = [

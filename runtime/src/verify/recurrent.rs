@@ -37,7 +37,7 @@ pub(super) fn run(
         progress();
         policy.set_noise(golden.noise(PartName::Robot, tick)?, golden.noise(PartName::Environment, tick)?)?;
         let action = (!golden.is_first(tick)?).then_some(golden.action(tick)?);
-        policy.observe(golden.image(tick)?, action.as_ref())?;
+        policy.observe(golden.inputs(tick)?, action.as_ref())?;
         let flips = flips_of(golden, policy.buffers(), tick)?;
         if flips.is_empty() {
             report.compare(golden, policy.buffers(), tick)?;

@@ -24,7 +24,7 @@ use crate::inspect::{Cost, CostError, InspectError, inspect};
 use crate::plot::{Curve, PlotError, plot};
 use rcwm_runtime::compile::{CompileError, Optimizations, compile};
 use rcwm_runtime::engine::EngineSettings;
-use rcwm_runtime::policy::{Policy, PolicyError, Sampling};
+use rcwm_runtime::policy::{Inputs, Policy, PolicyError, Sampling};
 use rcwm_runtime::realtime;
 use rcwm_runtime::telemetry::{LatencyFiles, Stage, Telemetry};
 
@@ -89,6 +89,9 @@ pub fn bench(
     let images = images.as_slice().filter(|_| count > 0);
     let images = images.ok_or(TensorsError::Missing { name: "input/image, at least one tick".into() })?;
     let image_len = images.len() / count;
+    let state_len = bundle.manifest.model.state;
+    let states = if state_len == 0 { None } else { bundle.golden.f32("input/state")?.as_slice() };
+    let states = states.filter(|states| states.len() == count * state_len);
     let warm_up = (ticks / 10).min(WARM_UP_MAX);
     let mut controls = Vec::new();
     let mut measured = 0;
@@ -100,9 +103,11 @@ pub fn bench(
             let _ = real_time.map(realtime::ask_for_helpers);
         }
         let image = &images[round % count * image_len..][..image_len];
+        let state = states.map_or(&[][..], |states| &states[round % count * state_len..][..state_len]);
+        let inputs = Inputs { image, state };
         for turn in 0..runners.len() {
             let index = (round + turn) % cases.len();
-            runners[index].tick(image, round % count == 0, round >= warm_up)?;
+            runners[index].tick(inputs, round % count == 0, round >= warm_up)?;
         }
         controls.iter_mut().for_each(Control::measure);
         measured += usize::from(round >= warm_up);
@@ -197,7 +202,7 @@ impl Runner {
 
     /// Ahead first, as a controller does after it has sent an action, then ready for the image, as it does before one is expected; then the
     /// image, as if it came now.
-    fn tick(&mut self, image: &[u8], is_first: bool, measured: bool) -> Result<(), PolicyError> {
+    fn tick(&mut self, inputs: Inputs<'_>, is_first: bool, measured: bool) -> Result<(), PolicyError> {
         let executed = self.executed.filter(|_| !is_first);
         let start = Instant::now();
         self.policy.work_ahead(executed.as_ref())?;
@@ -210,7 +215,7 @@ impl Runner {
         }
         let ready_ns = start.elapsed().as_nanos() as u64;
         let start = Instant::now();
-        let decision = self.policy.observe(image, executed.as_ref())?;
+        let decision = self.policy.observe(inputs, executed.as_ref())?;
         let tick_ns = start.elapsed().as_nanos() as u64;
         self.executed = Some(decision.action);
         if !measured {

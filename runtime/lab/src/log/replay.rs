@@ -14,7 +14,7 @@ use rcwm_runtime::log::{
     BundleIdentity, Entry, Header, LogError, LogReader, LoggedCall, LoggedOutcome, LoggedTick, TickRecord,
     WholeState, digest,
 };
-use rcwm_runtime::policy::{CallKind, CallOutcome, Policy, State, Surprise};
+use rcwm_runtime::policy::{CallKind, CallOutcome, InputReader, Policy, State, Surprise};
 use rcwm_runtime::telemetry::{Stage, Telemetry};
 
 use super::ReplayError;
@@ -31,6 +31,7 @@ pub struct Replayer {
     report: ReplayReport,
     resumed: bool,
     filter: SafetyFilter,
+    inputs: InputReader,
     /// What the safety filter let through last is in the log.
     last_sent_known: bool,
     /// What the policy decided last in this tick.
@@ -67,6 +68,7 @@ impl Replayer {
             bundles,
             running,
             filter: SafetyFilter::new(policy.limits(), header.rate_max),
+            inputs: InputReader::of(&policy.manifest().policy),
             policy,
             telemetry: Telemetry::new(),
             report,
@@ -145,6 +147,7 @@ impl Replayer {
         (self.running, self.policy) = load(&self.bundles, identity, &self.report.log, self.engine)?;
         self.states.clear();
         self.filter.take_limits(self.policy.limits());
+        self.inputs = InputReader::of(&self.policy.manifest().policy);
         self.report.swaps += 1;
         Ok(())
     }
@@ -229,8 +232,7 @@ impl Replayer {
             (CallKind::Imagine, Some(action), _) => drop(self.policy.imagine(action)),
             (CallKind::Observe, _, Some(observation)) => {
                 let observation = observation.view();
-                let camera = self.policy.camera(observation.format().interface())?;
-                drop(self.policy.observe(observation.image(camera), action))
+                drop(self.policy.observe(self.inputs.read(&observation)?, action))
             }
             (CallKind::SetState, ..) => self.go_back(&call.outcome)?,
             (CallKind::Imagine, None, _) | (CallKind::Observe, _, None) => return None,

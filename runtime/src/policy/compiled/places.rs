@@ -8,6 +8,7 @@ use crate::compile::{CompileError, inputs};
 /// Places of a whole tick; none for an input that no segment reads.
 pub(super) struct Places {
     pub(super) image: Option<Place>,
+    pub(super) state: Option<Place>,
     pub(super) action: Option<Place>,
     pub(super) robot: BranchPlaces,
     pub(super) environment: BranchPlaces,
@@ -36,6 +37,7 @@ impl Places {
         let environment = [inputs::ENVIRONMENT_Z, inputs::ENVIRONMENT_H, inputs::ENVIRONMENT_NOISE];
         Ok(Self {
             image: values.find(inputs::IMAGE),
+            state: values.find(inputs::STATE),
             action: values.find(inputs::ACTION),
             robot: BranchPlaces::of(values, PartName::Robot, robot, early)?,
             environment: BranchPlaces::of(values, PartName::Environment, environment, early)?,

@@ -1,0 +1,125 @@
+//! What of an observation a policy reads.
+
+use std::ops::Range;
+use std::sync::Arc;
+
+use rcwm_models::bundle::PolicyInputs;
+use rcwm_models::interface::Interface;
+use rcwm_models::wire::{Format, Observation};
+
+/// What a policy decides on.
+#[derive(Debug, Clone, Copy)]
+pub struct Inputs<'a> {
+    /// The cameras side by side, pixel by pixel: [S, S, 3 C], upright, RGB.
+    pub image: &'a [u8],
+    /// The measured numbers, in units; empty where the policy reads none.
+    pub state: &'a [f32],
+}
+
+impl<'a, I: AsRef<[u8]> + ?Sized> From<&'a I> for Inputs<'a> {
+    fn from(image: &'a I) -> Self {
+        Self { image: image.as_ref(), state: &[] }
+    }
+}
+
+/// Takes a policy's inputs out of observations, wherever they lie there.
+#[derive(Debug)]
+pub struct InputReader {
+    inputs: Vec<String>,
+    /// Of the last format, and what was found in it.
+    places: Option<(Arc<Format>, Places)>,
+    image: Vec<u8>,
+    state: Vec<f32>,
+}
+
+#[derive(Debug)]
+struct Places {
+    cameras: Vec<usize>,
+    states: Vec<Range<usize>>,
+}
+
+impl Places {
+    /// None where the robot lacks something.
+    fn of(inputs: &[String], robot: &Interface) -> Option<Self> {
+        let mut places = Self { cameras: Vec::new(), states: Vec::new() };
+        for name in inputs {
+            match robot.camera.iter().position(|camera| camera.name == *name) {
+                Some(camera) => places.cameras.push(camera),
+                None => places.states.push(robot.state_range(name)?),
+            }
+        }
+        (!places.cameras.is_empty()).then_some(places)
+    }
+}
+
+impl InputReader {
+    #[must_use]
+    pub fn of(policy: &PolicyInputs) -> Self {
+        let inputs = policy.inputs.clone();
+        Self { inputs, places: None, image: Vec::new(), state: Vec::new() }
+    }
+
+    /// The inputs; none where the observation is of a robot that lacks one. Allocates nothing after the first of a robot.
+    pub fn read<'a>(&'a mut self, observation: &Observation<'a>) -> Option<Inputs<'a>> {
+        let format = observation.format();
+        if self.places.as_ref().is_none_or(|(known, _)| !Arc::ptr_eq(known, format)) {
+            let found = Places::of(&self.inputs, format.interface())?;
+            self.places = Some((Arc::clone(format), found));
+        }
+        let (_, places) = self.places.as_ref()?;
+        self.state.clear();
+        for range in &places.states {
+            self.state.extend_from_slice(&observation.state()[range.clone()]);
+        }
+        if let [camera] = places.cameras[..] {
+            return Some(Inputs { image: observation.image(camera), state: &self.state });
+        }
+        self.image.resize(places.cameras.iter().map(|camera| observation.image(*camera).len()).sum(), 0);
+        let cameras = places.cameras.len();
+        for (at, camera) in places.cameras.iter().enumerate() {
+            let pixels = observation.image(*camera).as_chunks::<3>().0.iter();
+            for (to, pixel) in self.image.chunks_exact_mut(3).skip(at).step_by(cameras).zip(pixels) {
+                to.copy_from_slice(pixel);
+            }
+        }
+        Some(Inputs { image: &self.image, state: &self.state })
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use rcwm_models::wire::OwnedObservation;
+
+    use super::*;
+
+    fn format(cameras: &[&str]) -> Arc<Format> {
+        let mut interface = Interface::metaworld();
+        let first = interface.camera[0].clone();
+        let named =
+            |name: &&str| rcwm_models::interface::Camera { name: (*name).to_owned(), ..first.clone() };
+        interface.camera = cameras.iter().map(named).collect();
+        Format::of(interface)
+    }
+
+    #[test]
+    fn cameras_are_taken_by_name_and_laid_side_by_side() {
+        let mut observation = OwnedObservation::zeroed(&format(&["top", "wrist", "front"]));
+        for (camera, value) in [(0, 1), (1, 2), (2, 3)] {
+            observation.edit().image(camera).fill(value);
+        }
+        observation.edit().state().iter_mut().enumerate().for_each(|(at, x)| *x = at as f32);
+        let reader = |names: &[&str]| {
+            let inputs = names.iter().map(|name| (*name).to_owned()).collect();
+            InputReader::of(&PolicyInputs { inputs, limits: None })
+        };
+        let mut both = reader(&["front", "finger_vel", "top"]);
+        let found = both.read(&observation.view()).unwrap();
+        assert_eq!(
+            (found.image.len(), &found.image[..9]),
+            (2 * 64 * 64 * 3, &[3, 3, 3, 1, 1, 1, 3, 3, 3][..])
+        );
+        assert_eq!(found.state, [16.0, 17.0]);
+        assert_eq!(reader(&["wrist"]).read(&observation.view()).unwrap().image[..2], [2, 2]);
+        assert!(reader(&["front", "side"]).read(&observation.view()).is_none());
+    }
+}
