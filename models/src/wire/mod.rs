@@ -2,7 +2,8 @@
 //!
 //! Two publish-subscribe services per instance, `rcwm/<instance>/observation` and `rcwm/<instance>/action`, each with an
 //! event service of the same name that wakes the other side. A message is a header of fixed size and bytes that the interface of the
-//! robot lays out ([`crate::interface::Layout`]); it is written in place. A third service, `rcwm/<instance>/interface`, carries the
+//! robot lays out ([`crate::interface::Layout`]); it is written in place. Bytes
+//! begin at a multiple of 8: asked for more, iceoryx2 0.10 keeps that much room for every single byte. A third service, `rcwm/<instance>/interface`, carries the
 //! interface's canonical text: the robot publishes it when it opens the link and whenever it is asked, and a controller that finds
 //! that its policy does not fit says why and goes.
 //!

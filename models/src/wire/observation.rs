@@ -128,7 +128,7 @@ impl ObservationSample {
     ) -> Result<Self, usize> {
         let payload = sample.payload();
         let fits = payload.len() == format.layout().observation_bytes;
-        if !fits || !payload.as_ptr().cast::<Line>().is_aligned() {
+        if !fits || !payload.as_ptr().cast::<u64>().is_aligned() {
             return Err(payload.len());
         }
         // Read once: a peer may go on writing.

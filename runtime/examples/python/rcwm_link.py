@@ -367,8 +367,7 @@ class _Link:
             if value is not None:
                 attributes = attributes.require(iox2.AttributeKey.new(key), iox2.AttributeValue.new(value))
         return (
-            builder.payload_alignment(iox2.Alignment.new(_ALIGNMENT))
-            .history_size(1 if header is None else 0)
+            builder.history_size(1 if header is None else 0)
             .subscriber_max_buffer_size(1)
             .subscriber_max_borrowed_samples(2)
             .enable_safe_overflow(True)

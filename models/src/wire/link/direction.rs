@@ -31,8 +31,6 @@ pub(super) type Loan<H> = SampleMut<Ipc, [u8], H>;
 const SUBSCRIBERS_MAX: usize = 8;
 const NODES_MAX: usize = 16;
 const EVENT_ID_MAX: usize = 7;
-/// Blocks of a message are aligned to as much from its beginning.
-const PAYLOAD_ALIGNMENT: Alignment = Alignment::ALIGN_64;
 
 pub(super) const EVENT_PUBLISHED: usize = 0;
 pub(super) const EVENT_HELLO: usize = 1;
@@ -101,7 +99,6 @@ impl<H: Header> Direction<H> {
             .service_builder(&service)
             .publish_subscribe::<[u8]>()
             .user_header::<H>()
-            .payload_alignment(PAYLOAD_ALIGNMENT)
             .history_size(usize::from(topic.history))
             .subscriber_max_buffer_size(1)
             .subscriber_max_borrowed_samples(2)
@@ -119,12 +116,7 @@ impl<H: Header> Direction<H> {
     pub(super) fn check_version(node: &Node<Ipc>, instance: &str, topic: &str) -> Result<(), LinkError> {
         use iceoryx2::service::builder::publish_subscribe::PublishSubscribeOpenError::IncompatibleTypes;
         let (service, name) = service_name(instance, topic)?;
-        let opened = node
-            .service_builder(&name)
-            .publish_subscribe::<[u8]>()
-            .user_header::<H>()
-            .payload_alignment(PAYLOAD_ALIGNMENT)
-            .open();
+        let opened = node.service_builder(&name).publish_subscribe::<[u8]>().user_header::<H>().open();
         match opened {
             Err(IncompatibleTypes) => Err(Self::other_version(service)),
             // What else is wrong is said where it is to be used.

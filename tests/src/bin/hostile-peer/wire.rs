@@ -56,14 +56,12 @@ impl Wire {
             .service_builder(&observation)
             .publish_subscribe::<[u8]>()
             .user_header::<ObservationHeader>()
-            .payload_alignment(Alignment::ALIGN_64)
             .open()
             .map_err(failed("observations"))?;
         let answers = node
             .service_builder(&action)
             .publish_subscribe::<[u8]>()
             .user_header::<ActionHeader>()
-            .payload_alignment(Alignment::ALIGN_64)
             .open()
             .map_err(failed("actions"))?;
         let wake = node.service_builder(&observation).event().open().map_err(failed("events"))?;
