@@ -3,6 +3,7 @@
 use std::path::PathBuf;
 
 use rcwm_models::bundle::{Bundle, DType, PartName, TensorSpec};
+use rcwm_models::interface::Normaliser;
 use rcwm_models::tensors::{Tensors, TensorsError, Values};
 use rcwm_models::wire::ActionValues;
 
@@ -136,6 +137,22 @@ impl<'a> Golden<'a> {
             return Ok(ActionValues::zeros(self.bundle.manifest.model.action));
         }
         Ok(self.f32("input/action", tick)?.iter().copied().collect())
+    }
+
+    /// The same in the interface's units, as a robot reports it.
+    pub(super) fn executed(&self, tick: usize) -> Result<ActionValues, VerifyError> {
+        let action = self.action(tick)?;
+        let mut units = action;
+        let wrong = |_| VerifyError::Golden {
+            file: self.bundle.folder.join(&self.bundle.manifest.golden.file),
+            source: TensorsError::Unexpected {
+                name: "input/action".into(),
+                found: format!("{action:?}"),
+                expected: "finite numbers".into(),
+            },
+        };
+        Normaliser::of(&self.bundle.manifest.interface).to_units(&action, &mut units).map_err(wrong)?;
+        Ok(units)
     }
 
     /// Gumbel noise of a branch, `[2, n, m]`.

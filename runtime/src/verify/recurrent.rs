@@ -36,7 +36,7 @@ pub(super) fn run(
     for tick in 0..golden.ticks {
         progress();
         policy.set_noise(golden.noise(PartName::Robot, tick)?, golden.noise(PartName::Environment, tick)?)?;
-        let action = (!golden.is_first(tick)?).then_some(golden.action(tick)?);
+        let action = if golden.is_first(tick)? { None } else { Some(golden.executed(tick)?) };
         policy.observe(golden.inputs(tick)?, action.as_ref())?;
         let flips = flips_of(golden, policy.buffers(), tick)?;
         if flips.is_empty() {
