@@ -9,7 +9,20 @@ byte for byte the Rust programs' form, and `Interface.hash` is what two peers co
 """
 
 from .checks import check
+from .compare import compare_names, differences
 from .model import Action, Camera, Interface, InterfaceError, State
 from .text import load, parse, with_cameras
 
-__all__ = ["Action", "Camera", "Interface", "InterfaceError", "State", "check", "load", "parse", "with_cameras"]
+__all__ = [
+    "Action",
+    "Camera",
+    "Interface",
+    "InterfaceError",
+    "State",
+    "check",
+    "compare_names",
+    "differences",
+    "load",
+    "parse",
+    "with_cameras",
+]

@@ -25,7 +25,8 @@ def check(interface: Interface) -> None:
         _refuse(interface.name, f"{groups} states, cameras and actions", f"at most {GROUPS_MAX}")
     if not interface.actions:
         _refuse(interface.name, "no [[interface.action]]", "at least one: what the controller commands")
-    _unique("states and cameras", [part.name for part in (*interface.states, *interface.cameras)])
+    inputs = [state.name for state in interface.states] + [camera.name for camera in interface.cameras]
+    _unique("states and cameras", inputs)
     _unique("actions", [action.name for action in interface.actions])
     for state in interface.states:
         _name("state", state.name)

@@ -1,7 +1,7 @@
 """Small pictures of a MuJoCo model, many a second on a processor without graphics hardware.
 
-The physics keeps its model untouched. What is drawn is a copy of it: no shadows, reflections or multisampling, and meshes
-with a tenth of their triangles.
+The physics keeps its model untouched. What is drawn is a copy of it: no shadows, reflections or multisampling, and
+meshes with a tenth of their triangles.
 """
 
 from __future__ import annotations
@@ -27,9 +27,13 @@ COLLISION_GROUP = 0
 class Renderer:
     """Draws the fixed cameras of a model, upright, all of one size.
 
-    `model` and `data` are MuJoCo's; `robot` [nbody] says of each body whether it is the robot. `plain` draws as MuJoCo does by
-    default, for comparison. One renderer a process: its graphics context is made current once.
+    `model` and `data` are MuJoCo's; `robot` [nbody] says which bodies are the robot. `plain` draws as MuJoCo does
+    by default, for comparison. Several may be in use in one thread.
     """
+
+    # Whose graphics context is current: drawing in another gives black pictures and no error, and making it current for
+    # every picture takes a tenth of its time.
+    current: Renderer | None = None
 
     def __init__(self, model: mujoco.MjModel, data: mujoco.MjData, side: int, robot: np.ndarray, plain: bool = False):
         self.model, self.data, self.side, self.robot = model, data, side, robot
@@ -40,7 +44,7 @@ class Renderer:
             is_mesh = (model.geom_type == mujoco.mjtGeom.mjGEOM_MESH) & (model.geom_group != COLLISION_GROUP)
             simplify_meshes(drawn, np.unique(model.geom_dataid[is_mesh]))
         self.gl = mujoco.GLContext(side, side)
-        self.gl.make_current()
+        self._make_current()
         self.context = mujoco.MjrContext(drawn, mujoco.mjtFontScale.mjFONTSCALE_50)
         mujoco.mjr_setBuffer(mujoco.mjtFramebuffer.mjFB_OFFSCREEN.value, self.context)
         self.scene = mujoco.MjvScene(model, maxgeom=1000)
@@ -77,18 +81,26 @@ class Renderer:
         for thing in self.scene.geoms[: self.scene.ngeom]:
             if thing.segid >= 0 and thing.objtype == mujoco.mjtObj.mjOBJ_GEOM:
                 robot[thing.segid + 1] = self.robot[self.model.geom_bodyid[thing.objid]]
-        return robot[np.minimum(colour, self.scene.ngeom)]
+        mask: np.ndarray = robot[np.minimum(colour, self.scene.ngeom)]
+        return mask
 
     def close(self) -> None:
         """Frees the graphics context."""
-        self.gl.make_current()
+        self._make_current()
         self.context.free()
         self.gl.free()
+        Renderer.current = None
+
+    def _make_current(self) -> None:
+        if Renderer.current is not self:
+            self.gl.make_current()
+            Renderer.current = self
 
     def _render(self) -> np.ndarray:
+        self._make_current()
         mujoco.mjr_render(self.rectangle, self.scene, self.context)
         mujoco.mjr_readPixels(self.pixels, None, self.rectangle, self.context)
-        return self.pixels[::-1]  # the library's first row is the lowest
+        return np.flipud(self.pixels)  # the library's first row is the lowest
 
 
 def descendants(model: mujoco.MjModel, roots: list[str]) -> np.ndarray:

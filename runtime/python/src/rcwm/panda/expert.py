@@ -83,7 +83,7 @@ class Pushes:
 
 
 def down_along(fingers: np.ndarray, cube_axes: np.ndarray) -> np.ndarray:
-    """The hand's axes, [3, 3], when it points down and the fingers close along that side of the cube which is next to `fingers`."""
+    """The axes, [3, 3], of a hand that points down and closes along the side of the cube that is next to `fingers`."""
     sides = [sign * side for side in cube_axes.T if abs(side[2]) < 0.7 for sign in (1, -1)]
     flat = max(sides, key=lambda side: side @ fingers) * (1, 1, 0)
     across, down = flat / np.linalg.norm(flat), np.array([0.0, 0.0, -1.0])

@@ -23,8 +23,8 @@ import numpy as np
 SIDES = (64, 128)
 # Our names of robosuite's cameras.
 CAMERAS = {"front": "agentview", "wrist": "robot0_eye_in_hand"}
-# Where the front camera stands (m), what it looks at (m), and its angle from top to bottom (degrees). Nearer than robosuite's,
-# or the cube would be 3 pixels wide.
+# Where the front camera stands (m), what it looks at (m), and its angle from top to bottom (degrees). Nearer than
+# robosuite's, or the cube would be 3 pixels wide.
 FRONT_AT, FRONT_LOOKS_AT, FRONT_ANGLE = (0.46, -0.18, 1.13), (-0.04, 0.0, 0.9), 42.0
 # Sets of layouts that never meet, whatever seeds and numbers are given.
 LAYOUTS = ("learning", "choosing", "reporting")
@@ -116,7 +116,7 @@ class PandaLift:
     ) -> tuple[dict[str, np.ndarray], float, bool, bool, dict[str, Any]]:
         """Executes seven numbers in [-1, 1] for 50 ms: observation, reward, terminated (never), truncated, info.
 
-        Raises `ValueError`, and executes nothing, where the action has another length, is not finite or beyond its limits.
+        Raises `ValueError`, and executes nothing, for an action of another length, not finite or not in limits.
         """
         values = np.asarray(action, np.float64)
         if values.shape != (self.interface.action_numbers,) or not (np.abs(values) <= 1).all():
@@ -137,7 +137,7 @@ class PandaLift:
 
     @property
     def hand(self) -> tuple[np.ndarray, np.ndarray]:
-        """Where the fingers meet, [3] m, and its axes as columns, [3, 3]: x, along which the fingers close: y, out of the hand: z."""
+        """Where the fingers meet, [3] m, and its axes as columns, [3, 3]; fingers close along y and point along z."""
         return self.data.site_xpos[self._hand].copy(), self.data.site_xmat[self._hand].reshape(3, 3).copy()
 
     @property
