@@ -8,7 +8,7 @@
 | `is_first`, `is_last`, `is_terminal`, `success` | bool | [T] | |
 | `pushed` | bool | [T] | the action was a push off course and no example of what to do |
 | `proprio` | f32 | [T, n] | all states in the interface's order, in its units |
-| `robot_mask`, `robot_mask_2`, ... (optional) | u8 | [T, rows, columns, 1] | 1 where the robot is; cameras with a mask |
+| `robot_mask`, `robot_mask_2`, ... | u8 | [T, rows, columns, 1] | optional; 1 where the robot is |
 | `interface` | text | [1] | the interface's canonical text |
 """
 
@@ -167,8 +167,8 @@ def read(path: Path, expected: Interface | None = None) -> Episode:
             masks[camera.name] = _bytes(path, arrays, mask, shape)[..., 0]
     if parts["action"][parts["is_first"]].any():
         raise EpisodeError(
-            f"episode {path}: the first action is not zero, so actions stand at the image they were chosen on; "
-            "expected the one that led to it: a[1:] = a[:-1]; a[0] = 0"
+            f"episode {path}: the first action is not zero, so actions stand where they were chosen; "
+            "expected those that led to it: a[1:] = a[:-1]; a[0] = 0"
         )
     return Episode(interface=robot, images=images, masks=masks, **parts)
 
@@ -176,7 +176,7 @@ def read(path: Path, expected: Interface | None = None) -> Episode:
 def _interface(path: Path, arrays: dict[str, np.ndarray], expected: Interface | None) -> Interface:
     if "interface" not in arrays:
         if expected is None:
-            raise EpisodeError(f"episode {path}: carries no interface; give its robot's (--interface robot.toml)")
+            raise EpisodeError(f"episode {path}: carries no interface; give its robot's (--interface)")
         return expected
     own = interface.parse(str(arrays["interface"].reshape(-1)[0]))
     lines = interface.differences(expected, own) if expected else []

@@ -125,7 +125,7 @@ class Interface:
         return np.array([x for action in self.actions for x in action.high], np.float32)
 
     def pack(self, values: Mapping[str, np.ndarray]) -> np.ndarray:
-        """[state numbers] f32, all states in order. Raises `InterfaceError` where one is missing or has another length."""
+        """[state numbers] f32, all states in order. Raises `InterfaceError` where one is missing or too long."""
         parts = []
         for state in self.states:
             if state.name not in values:
