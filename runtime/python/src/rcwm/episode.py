@@ -137,8 +137,8 @@ def key_of(name: str, index: int) -> str:
 def read(path: Path, expected: Interface | None = None) -> Episode:
     """Reads a file. Without `expected` the file must carry its interface; with it, the two must fit.
 
-    Raises `EpisodeError` for a damaged file, a missing array, a wrong shape or type, numbers that are not finite, actions
-    that stand at the image they were chosen on, and another robot.
+    Raises `EpisodeError` for a damaged file, a missing array, a wrong shape or type, numbers that are not finite,
+    actions that stand at the image they were chosen on, and another robot.
     """
     try:
         with np.load(path, allow_pickle=False) as archive:
