@@ -62,9 +62,9 @@ def serve(
 ) -> Counts:
     """Serves whole episodes of a Gymnasium environment as the robot of an instance (or of a link that is open already).
 
-    In lock-step every observation waits for its answer. In real time the episode's clock begins with its first answer:
-    from then on an observation goes out every 1 / `rate_hz` s, and a tick without an answer, or after the controller has
-    left, executes the interface's safe action and goes on. An answer that is not finite, out of limits or of another
+    In lock-step every observation waits for its answer. In real time an episode begins to run with its first answer:
+    from then on an observation goes out every 1 / `rate_hz` s, and a tick without an answer, also where the controller
+    has left, executes the safe action and goes on. An answer that is not finite, out of limits or of another
     length is never executed: the safe action is, and it is counted. `observe` is described in `rcwm.gym`.
 
     Success is `info["success"]` or `info["is_success"]`; it counts where it ever was in an episode.

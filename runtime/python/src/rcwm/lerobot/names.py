@@ -9,6 +9,8 @@ from typing import Any
 from ..interface import Action, Interface, State
 from .form import ACTION, IMAGES, DatasetError
 
+# Names that one line of an error shows.
+NAMES_SHOWN_MAX = 8
 Features = Mapping[str, dict[str, Any]]
 
 
@@ -49,6 +51,11 @@ def find(features: Features, robot: Interface, renamed: Mapping[str, str]) -> Co
 
 def _offer(features: Features) -> str:
     return ", ".join(key for key in features if key.startswith(("observation.", ACTION)))
+
+
+def _some(names: list[str]) -> str:
+    more = len(names) - NAMES_SHOWN_MAX
+    return ", ".join(names[:NAMES_SHOWN_MAX]) + (f" and {more} more" if more > 0 else "")
 
 
 def _is_camera(entry: Mapping[str, Any]) -> bool:
@@ -96,7 +103,7 @@ def _group(
         places = [(key, place) for key, place, name in named if name in accepted]
         if len(places) != 1:
             how = "no" if not places else "more than one"
-            offer = ", ".join(name for _, _, name in named) or "none with names"
+            offer = _some([name for _, _, name in named]) or "none with names"
             hint = f"--map THEIRS={part.name}.{element}"
             raise DatasetError(f"{what} {part.name}: {how} number {element}; there is {offer} ({hint})")
         found += places

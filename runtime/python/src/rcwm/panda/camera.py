@@ -8,7 +8,14 @@ from __future__ import annotations
 
 import copy
 import os
+import sys
 
+from .. import RcwmError
+
+if "mujoco" in sys.modules and "MUJOCO_GL" not in os.environ:
+    raise RcwmError(
+        "MuJoCo was imported before it was told how to draw: import rcwm.panda first, or set MUJOCO_GL=osmesa"
+    )
 # At this size a second thread costs more than it draws.
 os.environ.setdefault("LP_NUM_THREADS", "0")
 os.environ.setdefault("MUJOCO_GL", "osmesa")
