@@ -6,12 +6,13 @@ import argparse
 from pathlib import Path
 
 from .. import RcwmError
-from ..cli import Parser, check_writable, count, run
+from ..cli import Parser, check_writable, count, run, write_json
 
 EXAMPLES = """examples:
   python -m rcwm.panda demonstrate --out data/lift --episodes 50 --seed 0
   python -m rcwm.panda demonstrate --out data/lift-pushed --episodes 50 --push 0.03 --masks
   python -m rcwm.panda measure --episodes 50 --layouts reporting --json runs/lift.json
+  python -m rcwm.panda serve --instance a --episodes 10 --layouts reporting --json runs/served.json
   python -m rcwm.panda interface --side 128 > robot.toml
 """
 
@@ -27,7 +28,11 @@ def main() -> None:
     measure = verbs.add_parser("measure", help="the expert's success and the steps a second", epilog=EXAMPLES)
     measure.add_argument("--plain", action="store_true", help="draw as MuJoCo does by default, for comparison")
     show = verbs.add_parser("interface", help="print the robot's interface", epilog=EXAMPLES)
-    for verb in (demonstrate, measure):
+    serve = verbs.add_parser("serve", help="the robot of an instance, for a controller", epilog=EXAMPLES)
+    serve.add_argument("--instance", required=True, help="the name given to the controller", metavar="NAME")
+    serve.add_argument("--realtime", action="store_true", help="at 20 Hz; without it the robot waits for every answer")
+    serve.add_argument("--timeout-s", type=float, default=60.0, help="give up after so long without an answer (60)")
+    for verb in (demonstrate, measure, serve):
         verb.add_argument("--episodes", type=count, default=50, help="layouts 0 to N - 1 (50)", metavar="N")
         verb.add_argument("--seed", type=int, default=0, help="of the layouts (0)")
         verb.add_argument(
@@ -37,9 +42,11 @@ def main() -> None:
             help="sets of layouts that never meet, whatever the seeds (learning)",
         )
         verb.add_argument("--steps", type=count, default=100, help="of an episode (100)")
+    for verb in (demonstrate, measure):
         verb.add_argument("--push", type=_chance, default=0.0, help="chance of a push off course at each step (0)")
+    for verb in (demonstrate, measure, serve):
         verb.add_argument("--json", type=Path, help="write the result to this file", metavar="FILE")
-    for verb in (demonstrate, measure, show):
+    for verb in (demonstrate, measure, serve, show):
         verb.add_argument("--side", type=int, choices=(64, 128), default=64, help="of the pictures, in pixels (64)")
         verb.add_argument("--cameras", default="front,wrist", help="with commas between (front,wrist)")
         verb.add_argument("--masks", action="store_true", help="with masks of the robot; takes longer")
@@ -56,12 +63,15 @@ def _do(options: argparse.Namespace) -> None:
         return
     if not 0 <= options.seed < 2**64:
         raise RcwmError(f"--seed {options.seed}: expected 0 to 2^64 - 1")
+    check_writable(options.json)
+    if options.verb == "serve":
+        _serve(options, cameras)
+        return
     from .demonstrate import Settings, demonstrate, measure
 
     settings = Settings(
         options.seed, options.layouts, options.side, cameras, options.masks, options.steps, options.push
     )
-    check_writable(options.json)
     if options.verb == "demonstrate":
         result = demonstrate(options.out, options.episodes, settings, options.json)
         rate = result["steps_per_second"]
@@ -73,6 +83,30 @@ def _do(options: argparse.Namespace) -> None:
     print(
         f"success {result['successes']}/{result['episodes']}, solved at step {result['solved_at_step_median']} "
         f"(median; last {result['solved_at_step_max']}), {result['steps_per_second_median']:.1f} steps/s"
+    )
+
+
+def _serve(options: argparse.Namespace, cameras: tuple[str, ...]) -> None:
+    from ..gym import serve
+    from .robot import PandaLift
+
+    robot = PandaLift(options.seed, options.layouts, options.side, cameras, options.masks, options.steps)
+    try:
+        counts = serve(
+            robot,
+            robot.interface,
+            options.instance,
+            episodes=options.episodes,
+            realtime=options.realtime,
+            timeout_s=options.timeout_s,
+        )
+    finally:
+        robot.close()
+    write_json(options.json, counts.as_dict())
+    refused = counts.refused_not_finite + counts.refused_out_of_limits + counts.refused_length
+    print(
+        f"{counts.episodes} episodes, success {counts.successes}; {counts.observations} observations, "
+        f"{counts.answers} answers ({refused} refused, {counts.missed_answers} missed)"
     )
 
 
