@@ -14,7 +14,7 @@ import numpy as np
 from .. import RcwmError
 from ..gym.link import Answer, Flags, Header, PeerClosed
 from ..interface import Interface
-from .messages import ALIGNMENT, CAMERAS_MAX, OWN_TASK, WIRE, ActionHeader, Layout, ObservationHeader
+from .messages import CAMERAS_MAX, OWN_TASK, WIRE, ActionHeader, Layout, ObservationHeader
 from .shm import reserved
 
 try:
@@ -140,8 +140,7 @@ class RobotLink:
             builder = builder.user_header(header)
             attributes = _require(attributes, "rcwm.interface", self.robot.hash)
         return (
-            builder.payload_alignment(iox2.Alignment.new(ALIGNMENT))
-            .history_size(1 if header is None else 0)
+            builder.history_size(1 if header is None else 0)
             .subscriber_max_buffer_size(1)
             .subscriber_max_borrowed_samples(2)
             .enable_safe_overflow(True)
