@@ -10,6 +10,7 @@ use crate::policy::ActionLimits;
 /// What is sent when the policy has nothing fit to send.
 #[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
 #[serde(rename_all = "lowercase")]
+#[expect(clippy::large_enum_variant, reason = "copied by a loop that must not allocate")]
 pub enum Fallback {
     /// The action that the robot executed last, or was sent last if that is later.
     Hold,

@@ -299,6 +299,7 @@ pub struct LoggedCall {
 
 /// How a call ended.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[expect(clippy::large_enum_variant, reason = "read and written one by one")]
 pub enum LoggedOutcome {
     /// Work ahead was done, in so many ns.
     Done(u64),

@@ -26,6 +26,7 @@ pub enum CallKind {
 
 /// How a call ended.
 #[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
+#[expect(clippy::large_enum_variant, reason = "copied by a loop that must not allocate")]
 pub enum CallOutcome {
     /// Work ahead was done.
     Done {

@@ -3,9 +3,11 @@
 use std::ops::Range;
 use std::sync::Arc;
 
-use rcwm_models::bundle::PolicyInputs;
+use rcwm_models::bundle::{PartName, PolicyInputs};
 use rcwm_models::interface::Interface;
 use rcwm_models::wire::{Format, Observation};
+
+use super::Policy;
 
 /// What a policy decides on.
 #[derive(Debug, Clone, Copy)]
@@ -83,6 +85,28 @@ impl InputReader {
             }
         }
         Some(Inputs { image: &self.image, state: &self.state })
+    }
+}
+
+impl Policy {
+    /// What about the inputs is not of the bundle's sizes, or no number.
+    pub(super) fn misfit(&self, inputs: Inputs<'_>) -> Option<String> {
+        let (found, expected) = (inputs.image.len(), self.image_bytes());
+        if found != expected {
+            return Some(format!("the image has {found} bytes, expected {expected}"));
+        }
+        let (found, expected) = (inputs.state.len(), self.manifest.model.state);
+        if found != expected {
+            return Some(format!("the state has {found} numbers, expected {expected}"));
+        }
+        inputs.state.iter().any(|x| !x.is_finite()).then(|| "the state holds what is no number".to_owned())
+    }
+
+    /// Bytes of the encoder's image.
+    #[must_use]
+    pub fn image_bytes(&self) -> usize {
+        let encoder = self.manifest.parts.iter().find(|part| part.name == PartName::Encoder);
+        encoder.and_then(|part| part.inputs.first()).map_or(0, |image| image.shape.iter().product())
     }
 }
 

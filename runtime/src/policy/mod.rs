@@ -30,7 +30,7 @@ pub use inputs::{InputReader, Inputs};
 pub use limits::ActionLimits;
 pub use noise::Sampling;
 pub use parts::{BranchBuffers, Buffers};
-pub use state::{BranchState, State};
+pub use state::{BranchState, State, Surprise};
 
 use std::path::{Path, PathBuf};
 use std::time::Instant;
@@ -47,16 +47,6 @@ use tick::{Tick, Work};
 
 /// Stages of a tick that are timed one by one, in the order they run.
 pub const STAGES: [PartName; 5] = PartName::REQUIRED;
-
-/// How far what was observed is from what was expected, per branch: `KL[q || p]` of posterior against prior in nats, summed over
-/// the categoricals. The robot's says "my arm does not move as I expect", the environment's "the scene changed".
-#[derive(Debug, Clone, Copy, PartialEq, Default, serde::Serialize, serde::Deserialize)]
-pub struct Surprise {
-    /// Robot branch.
-    pub robot: f32,
-    /// Environment branch.
-    pub environment: f32,
-}
 
 /// What the policy decided on one observation.
 #[derive(Debug, Clone, Copy, PartialEq)]
@@ -79,6 +69,7 @@ pub struct Decision {
 
 /// What led to the observation to come.
 #[derive(Debug, Clone, Copy, PartialEq)]
+#[expect(clippy::large_enum_variant, reason = "copied by a loop that must not allocate")]
 enum Before {
     /// Nothing: it is the first of its episode.
     Start,
@@ -346,26 +337,6 @@ impl Policy {
     pub fn set_noise(&mut self, robot: &[f32], environment: &[f32]) -> Result<(), PolicyError> {
         self.ahead = None;
         self.noise.set(robot, environment)
-    }
-
-    /// What about the inputs is not of the bundle's sizes, or no number.
-    fn misfit(&self, inputs: Inputs<'_>) -> Option<String> {
-        let (found, expected) = (inputs.image.len(), self.image_bytes());
-        if found != expected {
-            return Some(format!("the image has {found} bytes, expected {expected}"));
-        }
-        let (found, expected) = (inputs.state.len(), self.manifest.model.state);
-        if found != expected {
-            return Some(format!("the state has {found} numbers, expected {expected}"));
-        }
-        inputs.state.iter().any(|x| !x.is_finite()).then(|| "the state holds what is no number".to_owned())
-    }
-
-    /// Bytes of the encoder's image.
-    #[must_use]
-    pub fn image_bytes(&self) -> usize {
-        let encoder = self.manifest.parts.iter().find(|part| part.name == PartName::Encoder);
-        encoder.and_then(|part| part.inputs.first()).map_or(0, |image| image.shape.iter().product())
     }
 
     /// The bundle's folder.

@@ -2,6 +2,16 @@
 
 use rcwm_models::bundle::InitialState;
 
+/// How far what was observed is from what was expected, per branch: `KL[q || p]` of posterior against prior in nats, summed over
+/// the categoricals. The robot's says "my arm does not move as I expect", the environment's "the scene changed".
+#[derive(Debug, Clone, Copy, PartialEq, Default, serde::Serialize, serde::Deserialize)]
+pub struct Surprise {
+    /// Robot branch.
+    pub robot: f32,
+    /// Environment branch.
+    pub environment: f32,
+}
+
 #[derive(Debug, PartialEq, Default)]
 pub struct BranchState {
     /// Posterior z: n class indices.

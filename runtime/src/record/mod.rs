@@ -43,6 +43,7 @@ pub struct Recorder<S> {
     full: Option<SyncSender<Box<Record>>>,
     /// Records that come back from the writer, and those that have.
     back: Receiver<Box<Record>>,
+    #[expect(clippy::vec_box, reason = "records are handed to and fro, not copied")]
     free: Vec<Box<Record>>,
     thread: Option<JoinHandle<S>>,
     dropped: Arc<AtomicU64>,

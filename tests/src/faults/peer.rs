@@ -188,7 +188,7 @@ impl Peer {
     }
 
     fn publish(&self, observation: &OwnedObservation) -> Result<(), LinkError> {
-        self.link.publish_copy(&observation)
+        self.link.publish_copy(observation)
     }
 }
 

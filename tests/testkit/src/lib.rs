@@ -304,7 +304,7 @@ pub fn meet(peer: &SimulatorLink) {
 
 /// Publishes an observation and waits for the action that answers it.
 pub fn ask(peer: &SimulatorLink, observation: &OwnedObservation) -> Action {
-    peer.publish_copy(&observation).unwrap();
+    peer.publish_copy(observation).unwrap();
     let start = std::time::Instant::now();
     while start.elapsed() < NEVER {
         match peer.wait_action(Duration::from_millis(100)).unwrap() {

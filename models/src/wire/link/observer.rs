@@ -57,11 +57,17 @@ pub(super) fn action_of(sample: &Received<ActionHeader>, format: &Format) -> Res
     Ok(Action { answers, published_ns, source, action })
 }
 
-/// One direction of an instance, once its robot was found.
+/// One direction of an instance whose robot was found.
+struct Found<H: super::direction::Header> {
+    format: Arc<Format>,
+    receiver: Receiver<H>,
+}
+
+/// One direction of an instance, whose robot may come later.
 struct Listener<H: super::direction::Header> {
     settings: LinkSettings,
     topic: &'static str,
-    found: OnceCell<(Arc<Format>, Receiver<H>)>,
+    found: OnceCell<Found<H>>,
     inquirer: Inquirer,
     // Dropped last: the ports above belong to it.
     node: Node<Ipc>,
@@ -75,7 +81,7 @@ impl<H: super::direction::Header> Listener<H> {
         })
     }
 
-    fn find(&self, timeout: Duration) -> Result<Option<&(Arc<Format>, Receiver<H>)>, LinkError> {
+    fn find(&self, timeout: Duration) -> Result<Option<&Found<H>>, LinkError> {
         if let Some(found) = self.found.get() {
             return Ok(Some(found));
         }
@@ -84,7 +90,7 @@ impl<H: super::direction::Header> Listener<H> {
         let (instance, interface_hash) = (self.settings.instance.as_str(), Some(format.hash()));
         let topic = Topic { instance, name: self.topic, interface_hash, history: false };
         let receiver = Direction::open(&self.node, &topic)?.receiver()?;
-        Ok(Some(self.found.get_or_init(|| (Arc::clone(&format), receiver))))
+        Ok(Some(self.found.get_or_init(|| Found { format, receiver })))
     }
 }
 
@@ -105,7 +111,7 @@ impl ObserverLink {
     /// # Errors
     /// See [`LinkError`].
     pub fn wait_robot(&self, timeout: Duration) -> Result<Option<Arc<Format>>, LinkError> {
-        Ok(self.0.find(timeout)?.map(|(format, _)| Arc::clone(format)))
+        Ok(self.0.find(timeout)?.map(|found| Arc::clone(&found.format)))
     }
 
     /// Waits for the next observation; [`Wait::Closed`] when the simulator has said that none will come.
@@ -114,7 +120,9 @@ impl ObserverLink {
     /// [`LinkError::Traffic`].
     pub fn wait_observation(&self, timeout: Duration) -> Result<Wait<ObservationSample>, LinkError> {
         let start = Instant::now();
-        let Some((format, observations)) = self.0.find(timeout)? else { return Ok(Wait::TimedOut) };
+        let Some(Found { format, receiver: observations }) = self.0.find(timeout)? else {
+            return Ok(Wait::TimedOut);
+        };
         let left = timeout.saturating_sub(start.elapsed());
         Ok(match observations.wait(self.0.settings.spin, left)?.0 {
             Wait::Message(sample) => Wait::Message(observation_of(sample, format)?),
@@ -141,7 +149,7 @@ impl ActionObserverLink {
     /// # Errors
     /// [`LinkError::Traffic`].
     pub fn poll_action(&self) -> Result<Option<Action>, LinkError> {
-        let Some((format, actions)) = self.0.find(Duration::ZERO)? else { return Ok(None) };
+        let Some(Found { format, receiver: actions }) = self.0.find(Duration::ZERO)? else { return Ok(None) };
         // Signals are not looked at; they must not pile up.
         actions.take_events()?;
         actions.poll()?.map(|sample| action_of(&sample, format)).transpose()

@@ -143,6 +143,7 @@ pub(crate) enum Sequence {
 
 /// The action that a message says was executed.
 #[derive(Debug, Clone, Copy, PartialEq)]
+#[expect(clippy::large_enum_variant, reason = "there are few, and none is in a hurry")]
 pub(crate) enum Executed {
     /// The last one on the wire.
     AsSent,
