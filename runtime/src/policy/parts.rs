@@ -27,7 +27,7 @@ pub struct BranchBuffers {
 /// Everything between the parts of a tick.
 #[derive(Debug, Clone, Default)]
 pub struct Buffers {
-    /// Features of the shared encoder, `[2c, 16, 16]`; only where the parts run as exported.
+    /// Features of the shared encoder, `[2c, S/4, S/4]`; only where the parts run as exported.
     pub features: Vec<f32>,
     pub robot: BranchBuffers,
     /// The environment's z as the robot moves it (eq. 7), `[n, m]`.
@@ -53,7 +53,7 @@ impl Buffers {
 
     pub(super) fn new(model: &ModelSettings) -> Self {
         let (n, d, width) = (model.categoricals, model.deter, model.stoch_width());
-        let side = rcwm_models::IMAGE_SIDE / 4;
+        let side = model.image_side / 4;
         let branch = BranchBuffers {
             h_next: vec![0.0; d],
             prior_z: vec![0; n],
