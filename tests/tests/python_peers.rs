@@ -113,3 +113,41 @@ fn a_python_controller_sends_no_action_that_is_not_finite() {
     let told = output(command);
     assert_eq!(String::from_utf8_lossy(&told.stdout), "refused\n".repeat(3), "{told:?}");
 }
+
+#[test]
+fn a_robot_of_the_python_package_with_an_interface_of_its_own_is_driven() {
+    let (domain, interface) = (Domain::new(), root().join("models/src/interface/arm.toml"));
+    let script = "import sys, numpy as np\n\
+                  from rcwm.gym import Flags, Header\n\
+                  from rcwm.interface import load\n\
+                  from rcwm.link import RobotLink\n\
+                  robot = load(sys.argv[1])\n\
+                  link = RobotLink(robot, 'package')\n\
+                  for step in range(3):\n \
+                  header = Header(step, 0, step, Flags(1 if step == 0 else 0), 0.5, 7, 0, 0)\n \
+                  image = np.full((128, 96, 3), step, np.uint8)\n \
+                  link.publish(header, np.float32([0.1, 0.2]), np.float32([0.3, 0.4]), {'front': image}, {})\n \
+                  answer = link.wait_action(20)\n \
+                  while answer is not None and answer.answers != step: answer = link.wait_action(20)\n \
+                  assert np.allclose(answer.action, [step / 10, -1]), answer\n\
+                  link.close()";
+    let mut command: Command = domain.python("-c".as_ref());
+    command.arg(script).arg(&interface).env("PYTHONPATH", root().join("runtime/python/src"));
+    let mut robot = Running::start(command);
+    let controller = ControllerLink::open(domain.link("package"), |_| Vec::new()).unwrap();
+    let format = controller.wait_robot(Duration::from_secs(20)).unwrap().expect("it says its interface");
+    assert_eq!(format.interface(), &rcwm_models::interface::Interface::read(&interface).unwrap());
+    let mut seen = 0;
+    while let Wait::Message(observation) = controller.wait_observation(Duration::from_secs(20)).unwrap() {
+        let (view, step) = (observation.view(), observation.step);
+        assert_eq!((view.state(), view.executed()), (&[0.1, 0.2][..], &[0.3, 0.4][..]));
+        assert!(view.image(0).iter().all(|byte| u32::from(*byte) == step) && view.captured_ns[0] == 7);
+        let action = [step as f32 / 10.0, -1.0].into();
+        controller
+            .send(&Action { answers: observation.sequence, published_ns: 0, source: 0, action })
+            .unwrap();
+        seen = seen.max(step + 1);
+    }
+    assert_eq!(seen, 3);
+    robot.succeed();
+}

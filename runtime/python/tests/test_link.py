@@ -42,7 +42,7 @@ class Controller:
         for key, value in wanted.items():
             attributes = attributes.require(iox2.AttributeKey.new(key), iox2.AttributeValue.new(value))
         builder = builder.user_header(header) if header else builder
-        return builder.payload_alignment(iox2.Alignment.new(64)).open_with_attributes(attributes)
+        return builder.open_with_attributes(attributes)
 
     def signal(self, event):
         self.waker.notify_with_custom_event_id(iox2.EventId.new(event))
