@@ -39,7 +39,7 @@ pub mod tensors;
 pub mod terminal;
 pub mod wire;
 
-/// Side of the square images on the wire and into the encoder, in pixels.
+/// Side of the images of Meta-World's arm and of the presets' encoder, in pixels.
 pub const IMAGE_SIDE: usize = 64;
 /// Colour channels of an image.
 pub const IMAGE_CHANNELS: usize = 3;
@@ -47,7 +47,7 @@ pub const IMAGE_CHANNELS: usize = 3;
 pub const IMAGE_BYTES: usize = IMAGE_SIDE * IMAGE_SIDE * IMAGE_CHANNELS;
 /// Bytes of one robot mask (0 or 255 per pixel).
 pub const MASK_BYTES: usize = IMAGE_SIDE * IMAGE_SIDE;
-/// Length of an action: three translations of the hand and the gripper, each in [-1, 1].
+/// Length of an action of Meta-World's arm: three translations of the hand and the gripper, each in [-1, 1].
 pub const ACTION_LEN: usize = 4;
-/// Length of the proprioception vector: 9 joint positions, then 9 joint velocities.
+/// Length of the measured state of Meta-World's arm: 9 joint positions, then 9 joint velocities.
 pub const PROPRIOCEPTION_LEN: usize = 18;

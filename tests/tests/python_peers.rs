@@ -151,3 +151,29 @@ fn a_robot_of_the_python_package_with_an_interface_of_its_own_is_driven() {
     assert_eq!(seen, 3);
     robot.succeed();
 }
+
+#[test]
+fn an_episode_of_the_python_package_has_its_actions_from_limit_to_limit() {
+    let folder = tempfile::tempdir().unwrap();
+    let file = folder.path().join("episode.npz");
+    let script = "import sys, numpy as np\n\
+                  from pathlib import Path\n\
+                  from rcwm.episode import Recorder\n\
+                  from rcwm.interface import parse\n\
+                  robot = parse(open(sys.argv[1]).read().replace('128, 96, 3', '64, 64, 3'))\n\
+                  seen = {'front': np.full((64, 64, 3), 9, np.uint8), 'front_mask': np.ones((64, 64), np.uint8)}\n\
+                  seen['joint_pos'] = np.float32([0.1, 0.2])\n\
+                  recorder = Recorder(robot)\n\
+                  recorder.begin(seen)\n\
+                  recorder.add(seen, np.float32([2.9, -0.85]), 1.0, True, False)\n\
+                  recorder.finish().write(Path(sys.argv[2]))";
+    let mut command: Command = Domain::new().python("-c".as_ref());
+    command.arg(script).arg(root().join("models/src/interface/arm.toml")).arg(&file);
+    command.env("PYTHONPATH", root().join("runtime/python/src"));
+    let told = output(command);
+    assert!(told.status.success(), "{}", String::from_utf8_lossy(&told.stderr));
+    let episode = rcwm_models::episode::Episode::read(&file).unwrap();
+    assert_eq!(episode.action.as_slice().unwrap(), [0.0, 0.0, 1.0, -0.5]);
+    assert_eq!(episode.proprio.unwrap().row(1).to_vec(), [0.1, 0.2]);
+    assert!(episode.success[1] && episode.robot_mask.unwrap().iter().all(|pixel| *pixel));
+}

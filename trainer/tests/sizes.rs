@@ -117,6 +117,46 @@ fn a_short_training_lowers_the_loss_of_the_state() {
     }
 }
 
+/// Its size, too, and not only its direction: of a single number nothing else is left.
+#[test]
+fn a_state_ten_times_as_large_is_another_embedding() {
+    let model = ModelSettings { state: 1, ..small(ModelKind::Rcwm) };
+    let agent = Agent::new(&lively_parameters(&model).frozen(), &model).unwrap();
+    let image = batch(&model, 1, 1, false, 0).image;
+    let embedding = |size: f32| {
+        let state = Tensor::new(&[[[size]]], &Device::Cpu).unwrap();
+        let embeds = agent.world.encode(&image, Some(&state)).unwrap();
+        embeds[0].narrow(2, 16 * 4 * model.cnn_depth, model.hidden).unwrap()
+    };
+    let (one, other) = (embedding(0.5), embedding(5.0));
+    let (size, difference) = (largest(&one), largest(&(&one - &other).unwrap()));
+    assert!(difference > 0.3 * size, "differs by {difference}, the largest number is {size}");
+}
+
+/// Episodes that are equal but for the state, so that only its encoder can have brought it there.
+#[test]
+fn a_state_that_nothing_else_tells_reaches_the_robots_latent_state() {
+    let model = ModelSettings { state: 2, ..small(ModelKind::Rcwm) };
+    let mut replay = Replay::new(2000).fitting(&model);
+    for signs in [[1.0, 1.0], [1.0, -1.0], [-1.0, 1.0], [-1.0, -1.0]] {
+        let proprio = Some(Array2::from_shape_fn((20, 2), |(_, i)| signs[i]));
+        replay.add("reach", Episode { proprio, ..episode(&model, 20, 0.0) }).unwrap();
+    }
+    let parameters = agent::initialise(&model, 1, &Device::Cpu).unwrap();
+    let adam = AdamSettings { learning_rate: 3e-3, ..WorldSettings::default().adam };
+    let settings = WorldSettings { adam, ..WorldSettings::default() };
+    let mut learner = WorldLearner::new(&parameters, &model, &settings, Trained::World).unwrap();
+    let losses: Vec<f64> = (0..200)
+        .map(|number| {
+            let drawn = replay.draw(4, 8, false, 5, number).unwrap().into_tensors(&Device::Cpu).unwrap();
+            learner.update(&drawn, &mut Sampler::numbered(1, number)).unwrap().losses.state.unwrap()
+        })
+        .collect();
+    // Guessing the mean costs the variance: two numbers of symlog(1) squared.
+    let (last, guessing) = (losses[180..].iter().sum::<f64>() / 20.0, 2.0 * 2.0_f64.ln().powi(2));
+    assert!(last < 0.5 * guessing, "{last}, guessing costs {guessing}");
+}
+
 #[test]
 fn the_loss_of_the_state_gives_the_environment_no_gradient() {
     let model = small(ModelKind::Rcwm);
@@ -222,6 +262,17 @@ fn the_commands_take_the_sizes_and_refuse_what_they_do_not_have() {
     let of = |checkpoint| [&evaluate[..], &["--checkpoint", checkpoint, "--out", "shown"]].concat();
     run(&of("run/checkpoints/last")).success();
     assert!(folder.path().join("shown/robot_error.png").is_file());
+    let task = ["--task", "reach", "--out", "acted"];
+    for verb in [&["train", "--preset", "debug"][..], &["finetune", "--from", "made"]] {
+        let sizes = if verb[0] == "train" { &sizes[..2] } else { &[] };
+        let refused = run(&[verb, &task, sizes].concat()).failure();
+        let text = String::from_utf8(refused.get_output().stderr.clone()).unwrap();
+        assert!(text.contains("acting in simulators takes") && text.lines().count() == 1, "{text}");
+        assert!(!folder.path().join("acted").exists());
+    }
+    let refused = run(&["evaluate", "--task", "reach", "--checkpoint", "made"]).failure();
+    let text = String::from_utf8(refused.get_output().stderr.clone()).unwrap();
+    assert!(text.contains("acting in simulators takes"), "{text}");
     run(&["init", "--preset", "debug", "--out", "small"]).success();
     let refused = run(&of("small")).failure();
     let text = String::from_utf8(refused.get_output().stderr.clone()).unwrap();

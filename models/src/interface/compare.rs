@@ -82,6 +82,14 @@ pub fn mismatches(policy: &Interface, inputs: &[&str], robot: &Interface) -> Vec
             add(&mut found, &format!("action {}", action.name), text);
         }
     }
+    let names = |of: &Interface| of.action.iter().map(|action| action.name.clone()).collect::<Vec<_>>();
+    let (needed, has) = (names(policy), names(robot));
+    // An action's numbers go out one group after the other.
+    if needed != has && needed.iter().all(|name| has.contains(name)) && needed.len() == has.len() {
+        let text =
+            format!("in another order: {} of the policy, {} of the robot", needed.join(", "), has.join(", "));
+        add(&mut found, "actions", text);
+    }
     found
 }
 

@@ -300,6 +300,17 @@ fn what_a_policy_does_not_read_may_differ() {
     robot.camera.clear();
     robot.state.push(State { name: "extra".to_owned(), ..robot.state[0].clone() });
     assert_eq!(mismatches(&policy, &["joint_pos"], &robot), vec![]);
+    let two = |names: [&str; 2]| {
+        let mut interface = policy.clone();
+        let named = |name: &str| Action { name: name.to_owned(), ..policy.action[0].clone() };
+        interface.action = names.map(named).to_vec();
+        interface
+    };
+    let swapped = mismatches(&two(["left", "right"]), &["joint_pos"], &two(["right", "left"]));
+    assert_eq!(
+        swapped.iter().map(ToString::to_string).collect::<Vec<_>>(),
+        ["actions: in another order: left, right of the policy, right, left of the robot"]
+    );
     assert_eq!(
         mismatches(&policy, &["front"], &robot)[0].to_string(),
         "camera front: the robot has no such camera; it has none"

@@ -64,6 +64,12 @@ impl Format {
         ActionValues::zeros(self.action_numbers())
     }
 
+    /// What moves a robot least whose actions are displacements or velocities: zeros, or what is nearest to them within the limits.
+    #[must_use]
+    pub fn rest(&self) -> ActionValues {
+        ActionValues::from_fn(self.action_numbers(), |at| 0.0_f32.clamp(self.low[at], self.high[at]))
+    }
+
     /// Actions in units, and in [-1, 1] as models and episodes have them.
     #[must_use]
     pub fn normaliser(&self) -> &Normaliser {

@@ -417,7 +417,11 @@ class _Link:
             left_s = deadline - time.monotonic()
             if self._seen or left_s <= 0:
                 return None
-            activations = self._listener.timed_wait(iox2.Duration.from_secs_f64(left_s))
+            try:
+                activations = self._listener.timed_wait(iox2.Duration.from_secs_f64(left_s))
+            except iox2.ListenerWaitError:
+                # A signal to the program: what Python makes of it comes before the next wait.
+                continue
             self._seen.update(seen.id.as_value for seen in activations if seen.id.as_value != _PUBLISHED)
             if _ASKED in self._seen:
                 self._seen.discard(_ASKED)
@@ -459,7 +463,10 @@ class ControllerLink(_Link):
         while self.interface is None:
             self._notify(_ASKED)
             left_s = min(_ASK_EVERY_S, max(0.0, deadline - time.monotonic()))
-            self._said.timed_wait(iox2.Duration.from_secs_f64(left_s))
+            try:
+                self._said.timed_wait(iox2.Duration.from_secs_f64(left_s))
+            except iox2.ListenerWaitError:
+                continue  # as above
             sample = self._texts.receive()
             if sample is not None:
                 text = bytes(sample.payload().as_memory_view()).decode()

@@ -1,5 +1,7 @@
 """Episodes come back as they were written, and nothing else is read."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -71,3 +73,36 @@ def test_a_file_cut_off_is_refused_in_one_line(tmp_path, make_episode, share):
     with pytest.raises(EpisodeError) as error:
         read(path)
     assert "\n" not in str(error.value)
+
+
+def test_actions_are_from_limit_to_limit_in_the_file_and_in_units_beside_it(tmp_path, make_episode, small):
+    episode = make_episode(3)
+    episode.action[:] = [[0, 0], [2.0, -1.0], [-1.0, 0.25]]
+    episode.write(tmp_path / "a.npz")
+    assert np.load(tmp_path / "a.npz")["action"].tolist() == [[0, 0], [1, -1], [-0.5, 0.25]]
+    assert np.allclose(read(tmp_path / "a.npz", small).action, episode.action)
+    episode.action[1] = [2.1, 0]
+    with pytest.raises(EpisodeError, match="not within the interface's limits"):
+        episode.write(tmp_path / "b.npz")
+    arrays = dict(np.load(tmp_path / "a.npz")) | {"action": np.array([[0, 0], [1.7, 0], [0, 0]], np.float32)}
+    np.savez(tmp_path / "c.npz", **arrays)
+    with pytest.raises(EpisodeError, match=r"beyond \[-1, 1\]"):
+        read(tmp_path / "c.npz")
+
+
+def test_states_are_found_by_name_whatever_their_order_in_the_file(tmp_path, make_episode, small):
+    episode = make_episode(4)
+    episode.write(tmp_path / "a.npz")
+    position, velocity = small.states
+    swapped = replace(small, states=(velocity, position), cameras=small.cameras[1:])
+    found = read(tmp_path / "a.npz", swapped)
+    assert np.array_equal(found.proprio, episode.proprio[:, [2, 3, 0, 1]])
+    assert list(found.images) == ["wrist"]
+    assert found.interface == swapped
+
+
+def test_actions_in_another_order_are_of_another_robot(small):
+    arm = small.actions[0]
+    both = [replace(arm, name=name) for name in ("left", "right")]
+    lines = interface.differences(replace(small, actions=tuple(both)), replace(small, actions=tuple(both[::-1])))
+    assert lines == ["actions: in another order from number 1 on: left, right expected, right, left found"]

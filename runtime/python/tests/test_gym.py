@@ -122,9 +122,9 @@ def test_flags_say_where_an_episode_begins_ends_and_is_solved(small):
 
 
 def test_masks_travel_as_0_and_255_and_states_in_the_order_of_the_interface(small):
-    link, _, _ = run(small, lambda n: [0.3, 0.4])
+    link, _, _ = run(small, lambda n: [0.3, 0.2])
     _, state, _, images, masks = link.seen[1]
-    assert np.allclose(state, [0.3, 0.4, 0, 0])
+    assert np.allclose(state, [0.3, 0.2, 0, 0])
     assert np.unique(masks["front"]).tolist() == [0, 255]
     assert images["front"].shape == (32, 48, 3)
 
@@ -156,9 +156,9 @@ def test_what_must_not_be_executed_never_is_and_is_counted(small, bad, count):
 
 def test_a_jump_is_cut_to_the_rate_and_reported_as_executed(small):
     link, env, counts = run(small, lambda n: [-1.0 if n % 2 else 1.0, 0.0])
-    assert np.allclose([action[0] for action in env.executed], [1.0, 0.5, 1.0, 0.5])
-    assert np.allclose(link.seen[2][2], [0.5, 0.0])
-    assert counts.slowed_down == 2  # after 1.0 to 0.5, 1.0 is within the rate again
+    assert np.allclose([action[0] for action in env.executed], [0.75, 0.25, 0.75, 0.25])  # the arm stands at 0.25
+    assert np.allclose(link.seen[2][2], [0.25, 0.0])
+    assert counts.slowed_down == 4
 
 
 def test_an_answer_to_another_observation_is_not_executed(small):
@@ -216,9 +216,9 @@ def test_in_real_time_observations_go_out_at_the_rate(small):
 
 def test_in_real_time_a_tick_without_an_answer_is_one_at_rest(small):
     clock = Time()
-    script = [[0.3, 0.3], None, PeerClosed("left"), [0.1, 0.1], [0, 0]]
+    script = [[0.3, 0.2], None, PeerClosed("left"), [0.1, 0.1], [0, 0]]
     link, env, counts = run(small, lambda n: script[n], clock=clock, env=Arm(0, clock), realtime=True)
-    assert np.allclose(env.executed, [[0.3, 0.3], [0.3, 0.3], [0.3, 0.3], [0.1, 0.1]])
+    assert np.allclose(env.executed, [[0.3, 0.2], [0.3, 0.2], [0.3, 0.2], [0.1, 0.1]])
     assert (counts.missed_answers, counts.controllers_left, counts.rests) == (2, 1, 2)
     assert [Flags.ACTION_HELD in seen[0].flags for seen in link.seen] == [False, False, True, True, False]
 

@@ -243,3 +243,15 @@ def test_the_command_line_goes_there_and_back(dataset, small, tmp_path, monkeypa
     program.main()
     assert "2 episodes (2 new)" in capsys.readouterr().out
     assert json.loads((tmp_path / "result.json").read_text())["new"] == 2
+
+
+def test_a_folder_of_another_dataset_is_not_taken_for_this_ones(tmp_path, make_episode, small):
+    for seed in (0, 1):
+        make_episode(5, seed).write(tmp_path / f"npz{seed}" / "a.npz")
+        from_npz(tmp_path / f"npz{seed}", small, tmp_path / f"set{seed}", images=True)
+    info = tmp_path / "set1" / "meta" / "info.json"
+    info.write_text(info.read_text() + " ")
+    to_npz(tmp_path / "set0", small, tmp_path / "out")
+    assert to_npz(tmp_path / "set0", small, tmp_path / "out")["new"] == 0
+    with pytest.raises(RcwmError, match="another dataset"):
+        to_npz(tmp_path / "set1", small, tmp_path / "out")

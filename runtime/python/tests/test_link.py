@@ -1,7 +1,11 @@
 """The robot's end over shared memory, against a controller's end that is written here from the wire's description."""
 
 import ctypes
+import importlib.util
 import os
+import signal
+import subprocess
+import sys
 from pathlib import Path
 
 import numpy as np
@@ -9,6 +13,7 @@ import pytest
 
 iox2 = pytest.importorskip("iceoryx2")
 
+from rcwm import interface
 from rcwm.gym import Flags, Header, PeerClosed
 from rcwm.link import Layout, LinkError, RobotLink
 from rcwm.link.messages import ActionHeader, ObservationHeader
@@ -171,3 +176,72 @@ def test_nothing_is_left_in_shared_memory(small, prefix):
     del link
     left = [path.name for path in Path("/dev/shm").iterdir() if path.name.startswith(prefix)]
     assert [name for name in left if ".data" in name] == []
+
+
+def test_what_is_not_the_interfaces_is_not_published(link):
+    images = {"front": np.zeros((32, 48, 3), np.uint8), "wrist": np.zeros((16, 16, 3), np.uint8)}
+    header, state, executed = Header(0, 0, 0, Flags.FIRST, 0.0, 0, 0, 0), np.zeros(4), np.zeros(2)
+    half = images | {"front": images["front"][:16]}
+    real = images | {"wrist": np.zeros((16, 16, 3))}
+    masks = {"wrist": np.zeros((16, 16), np.uint8)}
+    for arguments, line in (
+        ((np.zeros(20), executed, images, {}), "state"),
+        ((state, np.array([np.nan, 0]), images, {}), "not finite"),
+        ((state, executed, half, {}), "picture front"),
+        ((state, executed, real, {}), "float64"),
+        ((state, executed, {"front": images["front"]}, {}), "cameras are"),
+        ((state, executed, images, masks), "masks"),
+    ):
+        with pytest.raises(LinkError, match=line):
+            link.publish(header, *arguments)
+
+
+def test_an_action_of_another_length_is_left_to_who_would_execute_it(link, join):
+    controller = join()
+    publish(link)
+    controller.send(0, [0.5])
+    assert link.wait_action(1.0).action.tolist() == [0.5]
+
+
+@pytest.mark.parametrize("name", ["SIGINT", "SIGTERM"])
+def test_whoever_ends_the_robot_the_controller_is_told(small, prefix, tmp_path, name):
+    (tmp_path / "robot.toml").write_text(small.canonical())
+    script = (
+        "import sys, time\nfrom rcwm import cli\nfrom rcwm.interface import load\nfrom rcwm.link import RobotLink\n"
+        "def main():\n"
+        "    link = RobotLink(load(sys.argv[1]), 'c')\n"
+        "    print('up', flush=True)\n"
+        "    try:\n"
+        "        while True: link.wait_action(60)\n"
+        "    finally: link.close()\n"
+        "cli.run(main)"
+    )
+    source = str(Path(__file__).parent.parent / "src")
+    environment = os.environ | {"PYTHONPATH": source}
+    command = [sys.executable, "-c", script, str(tmp_path / "robot.toml")]
+    robot = subprocess.Popen(command, stdout=subprocess.PIPE, text=True, env=environment)
+    assert robot.stdout.readline() == "up\n"
+    controller = Controller("c", small, prefix)
+    listener = controller.service("observation").event().open_or_create().listener_builder().create()
+    robot.send_signal(getattr(signal, name))
+    assert robot.wait(10) == 130
+    assert [event.id.as_value for event in listener.timed_wait(iox2.Duration.from_secs_f64(5))] == [2]
+    listener.delete()
+    controller.close()
+
+
+def test_the_example_that_is_copied_beside_a_robot_has_the_same_messages(small):
+    examples = Path(__file__).parents[2] / "examples" / "python"
+    spec = importlib.util.spec_from_file_location("rcwm_link", examples / "rcwm_link.py")
+    example = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(example)
+    metaworld = interface.parse(example.METAWORLD)
+    for robot in (small, metaworld, interface.parse(small.canonical().replace("0.5", "0.00001"))):
+        theirs = example.Interface(robot.canonical())
+        assert (theirs.canonical(), theirs.hash()) == (robot.canonical(), robot.hash)
+        layout, message = Layout.of(robot), example.observation_type(robot.canonical())
+        assert ctypes.sizeof(message) == 120 + layout.observation_bytes
+        assert message.executed_action.offset == 120 + layout.executed
+        assert message.image.offset == 120 + layout.images[robot.cameras[0].name]
+    assert example.ObservationHeader._fields_ == ObservationHeader._fields_
+    assert example.ActionHeader._fields_ == ActionHeader._fields_

@@ -140,7 +140,7 @@ def test_demonstrations_are_resumed_and_never_mixed(tmp_path):
     assert (tmp_path / "d/expert-seed5-00000.npz").stat().st_mtime_ns == before
     recorded = episode.read(tmp_path / "d/expert-seed5-00001.npz", panda_lift(64, ("front",)))
     assert len(recorded) == 9
-    with pytest.raises(RcwmError, match="other settings"):
+    with pytest.raises(RcwmError, match="another seed"):
         demonstrate(tmp_path / "d", 2, Settings(6, "choosing", 64, ("front",), False, 8, 0.0))
 
 

@@ -139,12 +139,16 @@ impl Fleet {
         Ok(gathered)
     }
 
-    /// Answers an observation with an action in [-1, 1]; one without numbers is the middle of the limits.
-    pub fn answer(&mut self, to: &Gathered, action: &[f32]) -> Result<(), FleetError> {
+    /// Answers an observation with an action in [-1, 1]; with none, with the least motion that the robot may be commanded.
+    pub fn answer(&mut self, to: &Gathered, action: Option<&[f32]>) -> Result<(), FleetError> {
         let format = to.observation.view().format();
-        let (mut units, middle) = (format.zeros(), format.zeros());
-        let action = if action.is_empty() { &*middle } else { action };
-        let action = format.normaliser().to_units(action, &mut units).map(|()| units)?;
+        let action = match action {
+            None => format.rest(),
+            Some(action) => {
+                let mut units = format.zeros();
+                format.normaliser().to_units(action, &mut units).map(|()| units)?
+            }
+        };
         match &mut self.members[to.simulator].client {
             Some(client) => Ok(client.answer(to.observation.sequence, action)?),
             None => Ok(()),

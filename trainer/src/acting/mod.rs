@@ -13,3 +13,26 @@ mod policy;
 pub use filter::filter_step;
 pub use fleet::{Fleet, FleetError, Gathered, Recorded};
 pub use policy::{Decision, Policy, PolicyInput};
+
+use rcwm_models::interface::Interface;
+use rcwm_models::settings::{ModelSettings, SettingsError};
+
+/// Whether a model of these sizes can act here: on one camera of 64 x 64, without a measured state, and, where simulators are `started`,
+/// with the actions of Meta-World's arm.
+///
+/// # Errors
+/// [`SettingsError::Invalid`] names the setting.
+pub fn check_acting(model: &ModelSettings, started: bool) -> Result<(), SettingsError> {
+    let arm = Interface::metaworld().action_numbers();
+    let action = if started { arm } else { model.action };
+    let needed =
+        [("image_side", model.image_side, 64), ("cameras", model.cameras, 1), ("state", model.state, 0)];
+    let wrong = needed.into_iter().chain([("action", model.action, action)]);
+    for (name, found, expected) in wrong.filter(|(_, found, expected)| found != expected) {
+        return Err(SettingsError::Invalid(format!(
+            "model.{name} = {found}, acting in simulators takes {expected}; learn from recorded data (pretrain, fewshot) and deploy \
+             the bundle with rcwm-runtime"
+        )));
+    }
+    Ok(())
+}

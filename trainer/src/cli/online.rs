@@ -8,6 +8,7 @@ use anyhow::Result;
 use candle_core::Device;
 use rcwm_models::settings::SettingsError;
 use rcwm_models::tasks::task_id;
+use rcwm_trainer::acting::check_acting;
 use rcwm_trainer::checkpoint::Checkpoint;
 use rcwm_trainer::replay::Folder;
 use rcwm_trainer::training::{
@@ -66,6 +67,7 @@ impl Online {
         }
         let settings = self.settings(begin)?;
         settings.validate()?;
+        check_acting(&settings.model, settings.finetune.simulators > 0)?;
         let mut training = if self.resume {
             Finetuning::resume(&self.out, settings.clone(), compute)?
         } else {

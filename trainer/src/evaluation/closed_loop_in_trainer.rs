@@ -48,7 +48,7 @@ pub fn closed_loop_in_trainer(
                 let (episode, step) = (one.observation.episode, one.observation.step);
                 return Err(ClosedLoopError::NotFinite { episode, step });
             }
-            fleet.answer(one, &decision.action)?;
+            fleet.answer(one, Some(&decision.action))?;
             if let Some(recorded) = fleet.record(one)? {
                 served[recorded.simulator].add(&recorded.episode);
             }

@@ -57,7 +57,10 @@ impl Part<'_> {
         let size = self.graph.shift(&size, 1.0);
         let size = self.graph.unary("Log", &size);
         let symlog = self.graph.mul(&sign, &size);
-        let x = self.dense("encoder.state.0", &symlog);
+        let one = self.graph.scalar(1.0);
+        let one = self.graph.reshape(&one, &[1, 1]);
+        let x = self.graph.concat(&[&symlog, &one], 1);
+        let x = self.dense("encoder.state.0", &x);
         self.dense("encoder.state.1", &x)
     }
 

@@ -36,7 +36,7 @@ impl Default for WorldSettings {
         Self {
             image_scale: 1.0,
             mask_scale: 1.0,
-            state_scale: 1.0,
+            state_scale: 10.0,
             reward_scale: 100.0,
             continue_scale: 1.0,
             dynamics_scale: 0.5,

@@ -1,4 +1,5 @@
-//! What the robot measures of itself (proprioception): into its posterior, and out of its latent state again. The environment never sees it.
+//! What the robot measures of itself (proprioception): into its posterior, and out of its latent state again. The
+//! environment learns of it only through the interaction, by h and the prior sample of the robot, from the next step on.
 
 use candle_core::{D, Result, Tensor};
 use rcwm_models::settings::ModelSettings;
@@ -27,7 +28,7 @@ impl Measured {
         let decoder = scope.at("decoder").at("state");
         Ok(Some(Self {
             encoder: [
-                Dense::new(&encoder.at(0), numbers, hidden)?,
+                Dense::new(&encoder.at(0), numbers + 1, hidden)?,
                 Dense::new(&encoder.at(1), hidden, hidden)?,
             ],
             decoder: Mlp::new(&decoder, settings.branch_width(), hidden, numbers, 1.0)?,
@@ -55,7 +56,10 @@ impl Measured {
                 "the model looks at a measured state of {needed} numbers, this one is {found:?}"
             )
         }
-        let x = self.encoder[0].forward(&ops::symlog(state)?)?; // [N, hidden]
+        let symlog = ops::symlog(state)?;
+        // The norm behind the first product drops the length of what it is given: beside a constant, the length is part of the direction.
+        let one = symlog.narrow(D::Minus1, 0, 1)?.ones_like()?;
+        let x = self.encoder[0].forward(&Tensor::cat(&[&symlog, &one], D::Minus1)?)?; // [N, hidden]
         Tensor::cat(&[embed, &self.encoder[1].forward(&x)?], D::Minus1)
     }
 

@@ -1,7 +1,7 @@
 use std::sync::atomic::{AtomicBool, Ordering};
 use std::time::Duration;
 
-use rcwm_models::interface::{Interface, Mismatch};
+use rcwm_models::interface::{ActionMode, Interface, Mismatch};
 use rcwm_models::wire::{
     Action, ActionSource, ActionValues, ControllerLink, LinkError, LinkSettings, ObservationSample, Wait,
 };
@@ -30,9 +30,21 @@ pub struct Client {
     answer: Option<Action>,
 }
 
-/// What the trainer needs of a robot: whatever it offers is recorded.
-fn needs(_: &Interface) -> Vec<Mismatch> {
-    Vec::new()
+/// What the trainer needs of a robot that it acts on: commands of which zeros are no motion, and that may change at once. Whatever else it
+/// offers is recorded.
+fn needs(robot: &Interface) -> Vec<Mismatch> {
+    let mut found = Vec::new();
+    for action in &robot.action {
+        let place = format!("action {}", action.name);
+        if action.mode == ActionMode::Absolute {
+            let text = "it commands positions, and the trainer acts by displacements and velocities only";
+            found.push(Mismatch::new(&place, text));
+        }
+        if action.rate_max.is_some() {
+            found.push(Mismatch::new(&place, "it has a rate_max, which the trainer does not keep"));
+        }
+    }
+    found
 }
 
 impl Client {

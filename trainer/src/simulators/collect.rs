@@ -198,7 +198,7 @@ fn run_job(
     })?;
     let mut recorder = Recorder::new(Client::of(process)?);
     // The simulator decides by itself: an answer is a receipt.
-    while let Some(recorded) = recorder.episode(stop, Format::zeros, || progress(Progress::Step))? {
+    while let Some(recorded) = recorder.episode(stop, Format::rest, || progress(Progress::Step))? {
         keep(job, &recorded)?;
         sums.entry((job.task.clone(), job.script.name().to_owned())).or_default().add(&recorded.episode);
         progress(Progress::Episode);

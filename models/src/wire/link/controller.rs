@@ -123,9 +123,14 @@ impl ControllerLink {
         spin: Duration,
         timeout: Duration,
     ) -> Result<Wait<ObservationSample>, LinkError> {
-        let start = Instant::now();
-        let Some(robot) = self.find_robot(timeout)? else { return Ok(Wait::TimedOut) };
-        let left = timeout.saturating_sub(start.elapsed());
+        let (robot, left) = match self.robot.get() {
+            Some(robot) => (robot, timeout),
+            None => {
+                let start = Instant::now();
+                let Some(robot) = self.find_robot(timeout)? else { return Ok(Wait::TimedOut) };
+                (robot, timeout.saturating_sub(start.elapsed()))
+            }
+        };
         Ok(match robot.observations.wait(spin, left)?.0 {
             Wait::Message(sample) => Wait::Message(observation_of(sample, &robot.format)?),
             Wait::TimedOut => Wait::TimedOut,

@@ -7,6 +7,7 @@
 | `rcwm.panda` | robosuite's Panda that lifts a cube, and its demonstrations | `rcwm[robosuite]` |
 | `rcwm.lerobot` | LeRobot datasets in and out | `rcwm[lerobot]` |
 | `rcwm.gym` | any Gymnasium environment as a robot | numpy |
+| `rcwm.link` | the robot's end of the link | `rcwm[link]` |
 """
 
 __version__ = "0.1.0"

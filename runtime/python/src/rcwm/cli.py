@@ -5,6 +5,7 @@ from __future__ import annotations
 import argparse
 import json
 import os
+import signal
 import sys
 import time
 from collections.abc import Callable
@@ -27,6 +28,8 @@ class Parser(argparse.ArgumentParser):
 
 def run(main: Callable[[], None]) -> None:
     """Runs a program: what a user can put right is one line and status 1; Ctrl-C and a closed pipe end it cleanly."""
+    # A stop by a service manager ends a program as Ctrl-C does: the peer is told.
+    signal.signal(signal.SIGTERM, signal.default_int_handler)
     try:
         main()
         sys.stdout.flush()
@@ -51,6 +54,26 @@ def write_json(path: Path | None, result: dict[str, Any]) -> None:
         beside.replace(path)
     except OSError as error:
         raise RcwmError(f"{path}: cannot be written ({error})") from None
+
+
+def claim(folder: Path, settings: dict[str, Any], name: str) -> None:
+    """Makes a folder one of episodes of these settings, which `name` in it says.
+
+    Raises `RcwmError` for one that holds others: they would be taken for those that were asked for.
+    """
+    path = folder / name
+    if path.exists():
+        try:
+            before = json.loads(path.read_text(encoding="utf-8"))
+        except (OSError, ValueError) as error:
+            raise RcwmError(f"{path}: cannot be read ({error}); remove the folder or choose another --out") from None
+        differ = [key for key in settings if not isinstance(before, dict) or before.get(key) != settings[key]]
+        if differ:
+            raise RcwmError(f"{folder}: holds episodes of another {', '.join(differ)}; choose another --out")
+        return
+    if folder.exists() and (not folder.is_dir() or any(folder.glob("*.npz"))):
+        raise RcwmError(f"{folder}: is no folder of ours ({name} is missing); choose another --out")
+    write_json(path, settings)
 
 
 def check_writable(path: Path | None) -> None:

@@ -3,21 +3,24 @@
 | key | type | shape | meaning |
 | --- | --- | --- | --- |
 | `image`, `image_2`, ... | u8 | [T, rows, columns, 3] | the cameras in the interface's order, upright, RGB |
-| `action` | f32 | [T, n] | the action that LED TO `image[t]`, in the interface's units; zeros at the first |
+| `action` | f32 | [T, n] | the action that LED TO `image[t]`, in [-1, 1] from limit to limit; zeros at the first |
 | `reward` | f32 | [T] | of that transition |
 | `is_first`, `is_last`, `is_terminal`, `success` | bool | [T] | |
 | `pushed` | bool | [T] | the action was a push off course and no example of what to do |
 | `proprio` | f32 | [T, n] | all states in the interface's order, in its units |
 | `robot_mask`, `robot_mask_2`, ... | u8 | [T, rows, columns, 1] | optional; 1 where the robot is |
 | `interface` | text | [1] | the interface's canonical text |
+
+In an `Episode` actions are in the interface's units.
 """
 
 from __future__ import annotations
 
 import os
+import re
 import tempfile
 import zipfile
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
@@ -27,7 +30,12 @@ from . import RcwmError, interface
 from .interface import Interface
 
 STEPS_MAX = 100_000
+# Of all arrays of a file together: more is not read.
+BYTES_MAX = 4 << 30
+# How far beyond a limit an action may be, as a share of half the range: it may have been rounded.
+ROUNDING = 1e-3
 FLAGS = ("is_first", "is_last", "is_terminal", "success", "pushed")
+_KEYS = re.compile(rf"(image|robot_mask)(_\d)?|action|reward|proprio|interface|{'|'.join(FLAGS)}")
 
 
 class EpisodeError(RcwmError):
@@ -60,7 +68,11 @@ class Episode:
             out[key_of("image", index)] = self.images[camera.name]
             if camera.name in self.masks:
                 out[key_of("robot_mask", index)] = self.masks[camera.name][..., None]
-        out |= {"action": self.action, "reward": self.reward, "proprio": self.proprio}
+        out |= {
+            "action": _scaled(self.interface, self.action, self.is_first),
+            "reward": self.reward,
+            "proprio": self.proprio,
+        }
         out |= {key: getattr(self, key) for key in FLAGS}
         out["interface"] = np.array([self.interface.canonical()])
         return out
@@ -142,7 +154,8 @@ def read(path: Path, expected: Interface | None = None) -> Episode:
     """
     try:
         with np.load(path, allow_pickle=False) as archive:
-            arrays = {key: archive[key] for key in archive.files}
+            _check_size(path, archive.zip)
+            arrays = {key: archive[key] for key in archive.files if _KEYS.fullmatch(key)}
     except (OSError, ValueError, EOFError, zipfile.BadZipFile, zipfile.error, KeyError, AttributeError) as error:
         reason = str(error).splitlines()[0] if str(error) else type(error).__name__
         raise EpisodeError(f"episode {path}: no whole archive of arrays ({reason}); record it again") from None
@@ -165,12 +178,60 @@ def read(path: Path, expected: Interface | None = None) -> Episode:
         if mask in arrays:
             shape = (steps, *camera.shape[:2], 1)
             masks[camera.name] = _bytes(path, arrays, mask, shape)[..., 0]
+    if (np.abs(parts["action"]) > 1 + ROUNDING).any():
+        raise EpisodeError(
+            f"episode {path}: actions beyond [-1, 1]; expected them from limit to limit, not in the interface's units"
+        )
     if parts["action"][parts["is_first"]].any():
         raise EpisodeError(
             f"episode {path}: the first action is not zero, so actions stand where they were chosen; "
             "expected those that led to it: a[1:] = a[:-1]; a[0] = 0"
         )
-    return Episode(interface=robot, images=images, masks=masks, **parts)
+    middle, half = _range(robot)
+    in_units = middle + half * np.clip(parts["action"].astype(np.float64), -1, 1)
+    parts["action"] = np.where(parts["is_first"][:, None], 0.0, in_units).astype(np.float32)
+    episode = Episode(interface=robot, images=images, masks=masks, **parts)
+    return episode if expected is None else _as_expected(episode, expected)
+
+
+def _check_size(path: Path, archive: zipfile.ZipFile) -> None:
+    size = sum(entry.file_size for entry in archive.infolist() if _KEYS.fullmatch(entry.filename.removesuffix(".npy")))
+    if size > BYTES_MAX:
+        raise EpisodeError(f"episode {path}: arrays of {size} bytes; expected at most {BYTES_MAX}")
+
+
+def _range(robot: Interface) -> tuple[np.ndarray, np.ndarray]:
+    """Middle and half width of each number of an action, f64, in units."""
+    low, high = robot.low.astype(np.float64), robot.high.astype(np.float64)
+    return (low + high) / 2, (high - low) / 2
+
+
+def _scaled(robot: Interface, action: np.ndarray, is_first: np.ndarray) -> np.ndarray:
+    """[T, n] f32 in [-1, 1] of actions in units. Raises `EpisodeError` where one is not within the limits."""
+    middle, half = _range(robot)
+    scaled = (action.astype(np.float64) - middle) / half
+    led = scaled[~is_first]
+    if not np.isfinite(led).all() or (np.abs(led) > 1 + ROUNDING).any():
+        raise EpisodeError(
+            "an executed action is not within the interface's limits; clip what is executed, and record that"
+        )
+    return np.where(is_first[:, None], 0.0, np.clip(scaled, -1, 1)).astype(np.float32)
+
+
+def _as_expected(episode: Episode, robot: Interface) -> Episode:
+    """The states and cameras that `robot` has, in its order."""
+    places, at = {}, 0
+    for state in episode.interface.states:
+        places[state.name] = list(range(at, at + len(state.elements)))
+        at += len(state.elements)
+    names = [camera.name for camera in robot.cameras]
+    return replace(
+        episode,
+        interface=robot,
+        images={name: episode.images[name] for name in names},
+        masks={name: episode.masks[name] for name in names if name in episode.masks},
+        proprio=episode.proprio[:, [place for state in robot.states for place in places[state.name]]],
+    )
 
 
 def _interface(path: Path, arrays: dict[str, np.ndarray], expected: Interface | None) -> Interface:
@@ -178,6 +239,8 @@ def _interface(path: Path, arrays: dict[str, np.ndarray], expected: Interface | 
         if expected is None:
             raise EpisodeError(f"episode {path}: carries no interface; give its robot's (--interface)")
         return expected
+    if arrays["interface"].size != 1:
+        raise EpisodeError(f"episode {path}: array 'interface' has {arrays['interface'].size} texts; expected one")
     own = interface.parse(str(arrays["interface"].reshape(-1)[0]))
     lines = interface.differences(expected, own) if expected else []
     if lines:

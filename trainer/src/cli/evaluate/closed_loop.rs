@@ -2,6 +2,7 @@
 
 use super::*;
 use rcwm_models::interface::Interface;
+use rcwm_trainer::acting::check_acting;
 
 impl Evaluate {
     pub(super) fn closed_loop(&self, stop: &AtomicBool) -> Result<()> {
@@ -63,6 +64,7 @@ impl Evaluate {
     /// Exports a checkpoint's policy into `folder`, if a runtime deploys its kind.
     pub(super) fn deployed(&self, checkpoint: &Path, folder: &Path, stop: &AtomicBool) -> Result<Deployed> {
         let checkpoint = Checkpoint::read(checkpoint, &Device::Cpu)?;
+        check_acting(&checkpoint.settings.model, true)?;
         let vanilla = checkpoint.settings.model.kind == ModelKind::Vanilla;
         if vanilla && self.engine != TRAINER_ENGINE {
             rcwm_models::errln!(

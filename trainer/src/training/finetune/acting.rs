@@ -16,10 +16,10 @@ impl Finetuning {
         let mut sampler = Sampler::numbered(self.core.settings.seed ^ ACTING_STREAM, number);
         let decisions = policy.decide(&seen, &mut sampler)?;
         for (one, decision) in going_on.into_iter().zip(&decisions) {
-            fleet.answer(one, &decision.action)?;
+            fleet.answer(one, (!decision.refused).then_some(&*decision.action))?;
         }
         for one in gathered.iter().filter(|one| one.is_last()) {
-            fleet.answer(one, &[])?;
+            fleet.answer(one, None)?;
         }
         self.core.state.policy_steps += gathered.iter().filter(|one| !one.is_first()).count() as u64;
         let refused = decisions.iter().filter(|decision| decision.refused).count() as u64;

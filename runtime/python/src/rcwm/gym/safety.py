@@ -29,18 +29,23 @@ class Safety:
         self.low, self.high = robot.low, robot.high
         most = [np.inf if part.rate_max is None else part.rate_max for part in robot.actions for _ in part.elements]
         self.most = np.array(most, np.float32)
-        self.last: np.ndarray | None = None
+        # NaN where it is not known: a position that is not measured, before the first command.
+        self.last = np.zeros(robot.action_numbers, np.float32)
+        self.commanded = False
 
     def begin(self, state: np.ndarray) -> np.ndarray:
-        """Begins an episode: what counts as executed before it. Zeros, or of an absolute action where its state is."""
-        self.last = None
-        start = np.clip(np.zeros(self.robot.action_numbers, np.float32), self.low, self.high)
+        """Begins an episode: what counts as executed before it.
+
+        Zeros, or of an absolute action where its state is; all zeros where that is not measured, which says that
+        nothing was executed.
+        """
+        self.commanded = False
+        self.last = np.clip(np.zeros(self.robot.action_numbers, np.float32), self.low, self.high)
         for part, place in self._parts():
             if part.mode == "absolute":
-                middle = (self.low[place] + self.high[place]) / 2
                 measured = self._measured(part.measured, state)
-                start[place] = np.clip(middle if measured is None else measured, self.low[place], self.high[place])
-        return start
+                self.last[place] = np.nan if measured is None else np.clip(measured, self.low[place], self.high[place])
+        return np.zeros_like(self.last) if np.isnan(self.last).any() else self.last.copy()
 
     def accept(self, action: np.ndarray) -> np.ndarray | Refused:
         """What is executed of an answer: itself, with changes beyond `rate_max` cut off; or why nothing is."""
@@ -53,9 +58,9 @@ class Safety:
         if (values < self.low - room).any() or (values > self.high + room).any():
             return Refused.OUT_OF_LIMITS
         values = np.clip(values, self.low, self.high)
-        if self.last is not None:
-            values = np.clip(values, self.last - self.most, self.last + self.most)
-        self.last = values.astype(np.float32)
+        known = np.isfinite(self.last)
+        nearest = np.clip(values, self.last - self.most, self.last + self.most)
+        self.last, self.commanded = np.where(known, nearest, values).astype(np.float32), True
         return self.last
 
     def rest(self, state: np.ndarray) -> np.ndarray | None:
@@ -64,14 +69,14 @@ class Safety:
         for part, place in self._parts():
             if isinstance(part.fallback, tuple):
                 rest[place] = part.fallback
-            elif part.fallback == "hold-measured" or (part.fallback == "hold" and self.last is None):
+            elif part.fallback == "hold-measured" or (part.fallback == "hold" and not self.commanded):
                 measured = self._measured(part.measured, state)
                 if measured is None:
                     return None
                 rest[place] = measured
-            elif part.fallback == "hold" and self.last is not None:
+            elif part.fallback == "hold":
                 rest[place] = self.last[place]
-        self.last = np.clip(rest, self.low, self.high)
+        self.last, self.commanded = np.clip(rest, self.low, self.high), True
         return self.last
 
     def _parts(self) -> Iterator[tuple[Action, slice]]:

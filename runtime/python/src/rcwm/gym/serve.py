@@ -72,13 +72,19 @@ def serve(
     """
     check_action_space(env, interface)
     link = _open(interface, instance) if isinstance(instance, str) else instance
+    loop = None
     try:
         loop = _Loop(env, interface, link, observe, realtime, timeout_s, clock or Clock())
         for episode in range(episodes):
             loop.episode(seed if episode == 0 else None)
         return loop.counts
     finally:
-        link.close()
+        # The peer first, then the robot: whatever ends the loop, neither is left with the last command.
+        try:
+            link.close()
+        finally:
+            if loop is not None:
+                loop.come_to_rest()
 
 
 def _open(interface: Interface, instance: str) -> Link:
@@ -103,6 +109,8 @@ class _Loop:
         self.period_ns = round(1e9 / robot.rate_hz)
         self.safety, self.counts = Safety(robot), Counts()
         self.sequence = 0
+        #: What is measured in the middle of an episode.
+        self.measured: np.ndarray | None = None
         self.durations_ns: deque[int] = deque([0], STEPS_WATCHED)
 
     def episode(self, seed: int | None) -> None:
@@ -121,6 +129,7 @@ class _Loop:
                 scheduled_ns or captured_ns, self.period_ns if self.realtime else 0,
             ))  # fmt: skip
             over = Flags.LAST in flags
+            self.measured = None if over else seen.state
             answer = self._first_answer() if scheduled_ns is None else self._answer_by(scheduled_ns)
             if self.realtime and scheduled_ns is None:
                 scheduled_ns = self.clock.now_ns()
@@ -141,6 +150,13 @@ class _Loop:
             succeeded |= Flags.SUCCESS in flags
         self.counts.episodes += 1
         self.counts.successes += succeeded
+
+    def come_to_rest(self) -> None:
+        """One safe action where an episode was broken off."""
+        measured, self.measured = self.measured, None
+        rest = None if measured is None else self.safety.rest(measured)
+        if rest is not None:
+            self.env.step(rest.copy())
 
     def _publish(self, seen: Seen, executed: np.ndarray, header: Header) -> None:
         with_mask = [camera.name for camera in self.robot.cameras if camera.mask]

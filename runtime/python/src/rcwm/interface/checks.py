@@ -8,7 +8,20 @@ from typing import NoReturn
 
 import numpy as np
 
-from .model import ELEMENTS_MAX, GROUPS_MAX, MODES, NAME_MAX, RULES, SIDE_MAX, Action, Interface, InterfaceError
+from .model import (
+    ACTION_NUMBERS_MAX,
+    CAMERAS_MAX,
+    ELEMENTS_MAX,
+    GROUPS_MAX,
+    MODES,
+    NAME_MAX,
+    OBSERVATION_BYTES_MAX,
+    RULES,
+    SIDE_MAX,
+    Action,
+    Interface,
+    InterfaceError,
+)
 
 
 def _refuse(place: str, found: str, expected: str) -> NoReturn:
@@ -23,6 +36,11 @@ def check(interface: Interface) -> None:
     groups = len(interface.states) + len(interface.cameras) + len(interface.actions)
     if groups > GROUPS_MAX:
         _refuse(interface.name, f"{groups} states, cameras and actions", f"at most {GROUPS_MAX}")
+    if len(interface.cameras) > CAMERAS_MAX:
+        _refuse(interface.name, f"{len(interface.cameras)} cameras", f"at most {CAMERAS_MAX}")
+    numbers = sum(len(action.elements) for action in interface.actions)
+    if numbers > ACTION_NUMBERS_MAX:
+        _refuse(interface.name, f"{numbers} numbers of all actions together", f"at most {ACTION_NUMBERS_MAX}")
     if not interface.actions:
         _refuse(interface.name, "no [[interface.action]]", "at least one: what the controller commands")
     inputs = [state.name for state in interface.states] + [camera.name for camera in interface.cameras]
@@ -43,6 +61,9 @@ def check(interface: Interface) -> None:
             _refuse(place, f"mask = {camera.mask!r}", "robot, or none")
     for action in interface.actions:
         _action(action, interface)
+    pixels = sum(camera.shape[0] * camera.shape[1] * (4 if camera.mask else 3) for camera in interface.cameras)
+    if pixels > OBSERVATION_BYTES_MAX:
+        _refuse(interface.name, f"pictures of {pixels} bytes", f"at most {OBSERVATION_BYTES_MAX}")
 
 
 def _action(action: Action, interface: Interface) -> None:

@@ -26,6 +26,9 @@ def differences(wanted: Interface, has: Interface) -> list[str]:
                 found.append(f"{what} {part.name}: missing; there is {', '.join(by_name) or 'none'}")
             else:
                 found += [f"{what} {part.name}: {line}" for line in _parts(part, by_name[part.name])]
+    ordered = [action.name for action in wanted.actions], [action.name for action in has.actions]
+    if ordered[0] != ordered[1] and sorted(ordered[0]) == sorted(ordered[1]):
+        found += [f"actions: {line}" for line in compare_names(*ordered)]
     own = {action.name for action in wanted.actions}
     found += [f"action {action.name}: not expected" for action in has.actions if action.name not in own]
     return found
@@ -49,11 +52,11 @@ def _parts(ours: State | Camera | Action, theirs: State | Camera | Action) -> li
     for key in keys:
         a, b = getattr(ours, key), getattr(theirs, key)
         if a != b:
-            found.append(f"{key} {_words(a)} expected, {_words(b)} found")
+            found.append(f"{key} {_label(a)} expected, {_label(b)} found")
     if not isinstance(ours, Camera) and not isinstance(theirs, Camera):
         found += compare_names(ours.elements, theirs.elements)
     return found
 
 
-def _words(value: object) -> str:
+def _label(value: object) -> str:
     return ", ".join(map(str, value)) if isinstance(value, tuple) else str(value if value is not None else "none")

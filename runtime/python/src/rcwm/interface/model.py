@@ -14,6 +14,7 @@ import numpy as np
 from .. import RcwmError
 
 GROUPS_MAX, ELEMENTS_MAX, SIDE_MAX, NAME_MAX = 64, 1024, 4096, 64
+ACTION_NUMBERS_MAX, CAMERAS_MAX, OBSERVATION_BYTES_MAX = 64, 8, 256 << 20
 MODES = ("absolute", "delta", "velocity")
 RULES = ("hold", "hold-measured", "zero")
 

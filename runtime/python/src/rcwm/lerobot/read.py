@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import hashlib
 import io
 import json
 from collections.abc import Iterable, Mapping
@@ -14,7 +15,7 @@ import pyarrow.parquet as pq
 from PIL import Image, UnidentifiedImageError
 
 from .. import interface
-from ..cli import Progress
+from ..cli import Progress, claim
 from ..episode import FLAGS, Episode, key_of
 from ..interface import Interface
 from . import form, names
@@ -32,6 +33,8 @@ def to_npz(root: Path, robot: Interface, out: Path, renamed: Mapping[str, str] |
     actions left out, and of episodes whose success only such an action led to. Raises `RcwmError`.
     """
     dataset = _Dataset(root, robot, renamed or {})
+    info = hashlib.sha256((root / form.INFO).read_bytes()).hexdigest()
+    claim(out, {"dataset": info, "interface": robot.hash, "map": dict(renamed or {})}, "dataset.json")
     result = {"episodes": len(dataset.rows), "new": 0, "actions_left_out": 0, "successes_left_out": 0}
     progress = Progress(len(dataset.rows), "episodes")
     try:
@@ -242,6 +245,11 @@ def _read_info(root: Path) -> dict[str, Any]:
         info = json.loads(path.read_text(encoding="utf-8"))
         version, _, features = str(info["codebase_version"]), info["fps"] + 0, dict(info["features"])
         info["data_path"].format(chunk_index=0, file_index=0)
+        for key, entry in features.items():
+            if not isinstance(entry["dtype"], str) or not all(isinstance(side, int) for side in entry["shape"]):
+                raise ValueError(f"feature {key} has no dtype and shape")
+        if any(entry["dtype"] == "video" for entry in features.values()):
+            info["video_path"].format(video_key="a", chunk_index=0, file_index=0)
     except (OSError, ValueError, KeyError, TypeError, AttributeError) as error:
         raise DatasetError(f"{path}: no dataset of LeRobot ({type(error).__name__}: {error})") from None
     if not version.startswith("v3."):

@@ -71,7 +71,7 @@ class RobotLink:
         images: Mapping[str, np.ndarray],
         masks: Mapping[str, np.ndarray],
     ) -> None:
-        """See `rcwm.gym.Link`."""
+        """See `rcwm.gym.Link`. Raises `LinkError` for numbers, pictures and masks that are not the interface's."""
         out = ObservationHeader(
             sequence=header.sequence,
             episode=header.episode,
@@ -83,18 +83,29 @@ class RobotLink:
             reward=header.reward,
         )
         payload = bytearray(self.layout.observation_bytes)
-        _put(payload, self.layout.state, np.asarray(state, "<f4"))
-        _put(payload, self.layout.executed, np.asarray(executed, "<f4"))
+        _put(payload, self.layout.state, "state", _numbers("state", state), (self.robot.state_numbers,))
+        _put(
+            payload,
+            self.layout.executed,
+            "executed action",
+            _numbers("executed action", executed),
+            self.robot.low.shape,
+        )
+        if set(images) != set(self.layout.images) or not set(masks) <= set(self.layout.masks):
+            raise LinkError(
+                f"pictures {sorted(images)}, masks {sorted(masks)}; the robot's cameras are {list(self.layout.images)}"
+            )
         for place, camera in enumerate(self.robot.cameras):
             out.captured_ns[place] = header.captured_ns
-            _put(payload, self.layout.images[camera.name], images[camera.name])
+            _put(payload, self.layout.images[camera.name], f"picture {camera.name}", images[camera.name], camera.shape)
             if camera.name in masks:
-                _put(payload, self.layout.masks[camera.name], masks[camera.name])
+                shape = camera.shape[:2]
+                _put(payload, self.layout.masks[camera.name], f"mask {camera.name}", masks[camera.name], shape)
         self._published = (out, payload)
         self._send()
 
     def wait_action(self, timeout_s: float) -> Answer | None:
-        """See `rcwm.gym.Link`. Raises `LinkError` for a message of another length."""
+        """See `rcwm.gym.Link`."""
         deadline = time.monotonic() + timeout_s
         while True:
             sample = self._subscriber.receive()
@@ -106,14 +117,22 @@ class RobotLink:
             left_s = deadline - time.monotonic()
             if left_s <= 0:
                 return None
-            activations = self._listener.timed_wait(iox2.Duration.from_secs_f64(left_s))
+            try:
+                activations = self._listener.timed_wait(iox2.Duration.from_secs_f64(left_s))
+            except iox2.ListenerWaitError:
+                # A signal to the program: what Python makes of it comes before the next wait.
+                continue
             self._signals.update(one.id.as_value for one in activations)
-            self._heed()
+            self._handle_signals()
 
     def close(self) -> None:
         """Tells the controller that no further observation will come, and leaves shared memory clean."""
         if self._ports:
-            _notify(self._notifier, CLOSED)
+            try:
+                _notify(self._notifier, CLOSED)
+            except KeyboardInterrupt:
+                _notify(self._notifier, CLOSED)
+                raise
         for port in self._ports:
             port.delete()
         self._ports = []
@@ -128,9 +147,16 @@ class RobotLink:
         self._listener = self._event("action").listener_builder().create()
         self._publisher = _publisher(observations, self.layout.observation_bytes)
         self._notifier = self._event("observation").notifier_builder().create()
-        self._teller = _publisher(self._data("interface", None), len(self._text))
-        self._tells = self._event("interface").notifier_builder().create()
-        self._ports = [self._publisher, self._subscriber, self._notifier, self._listener, self._teller, self._tells]
+        self._announcer = _publisher(self._data("interface", None), len(self._text))
+        self._announcer_waker = self._event("interface").notifier_builder().create()
+        self._ports = [
+            self._publisher,
+            self._subscriber,
+            self._notifier,
+            self._listener,
+            self._announcer,
+            self._announcer_waker,
+        ]
 
     def _data(self, topic: str, header: type | None) -> Any:
         """A publish-subscribe service; without a header it is that of the interface, whose last message is kept."""
@@ -174,7 +200,7 @@ class RobotLink:
             return LinkError(f"instance {self.instance}: somebody is there with another version of the messages")
         return LinkError(f"instance {self.instance}: the link cannot be made ({text})")
 
-    def _heed(self) -> None:
+    def _handle_signals(self) -> None:
         """Acts on signals, all but that the controller has left."""
         if ASKED in self._signals:
             self._announce()
@@ -184,10 +210,10 @@ class RobotLink:
         self._signals &= {CLOSED}
 
     def _announce(self) -> None:
-        sample = self._teller.loan_slice_uninit(len(self._text))
+        sample = self._announcer.loan_slice_uninit(len(self._text))
         ctypes.memmove(sample.payload_ptr, self._text, len(self._text))
         sample.assume_init().send()
-        _notify(self._tells, PUBLISHED)
+        _notify(self._announcer_waker, PUBLISHED)
 
     def _send(self) -> None:
         """Publishes what is to be published, with the time of now."""
@@ -204,16 +230,26 @@ class RobotLink:
         _notify(self._notifier, PUBLISHED)
 
     def _answer(self, sample: Any) -> Answer:
-        length = sample.payload().len()
-        if length != self.layout.action_bytes:
-            raise LinkError(f"an action of {length} bytes; expected {self.layout.action_bytes}")
+        # One of another length is refused where it would be executed.
+        length = sample.payload().len() // 4 * 4
         # Copied: the memory goes back to its publisher when the sample is dropped.
         header = ActionHeader.from_buffer_copy(ctypes.string_at(sample.user_header_ptr, ctypes.sizeof(ActionHeader)))
         numbers = np.frombuffer(ctypes.string_at(sample.payload_ptr, length), "<f4").copy()
         return Answer(int(header.answers), numbers)
 
 
-def _put(payload: bytearray, at: int, values: np.ndarray) -> None:
+def _numbers(what: str, values: np.ndarray) -> np.ndarray:
+    numbers = np.asarray(values, "<f4")
+    if not np.isfinite(numbers).all():
+        raise LinkError(f"{what}: {numbers.tolist()} is not finite; nothing was published")
+    return numbers
+
+
+def _put(payload: bytearray, at: int, what: str, values: np.ndarray, shape: tuple[int, ...]) -> None:
+    dtype = "float32" if values.dtype == np.float32 else "uint8"
+    if values.shape != shape or values.dtype != dtype:
+        found = f"{list(values.shape)} {values.dtype}"
+        raise LinkError(f"{what}: {found}; expected {list(shape)} {dtype}; nothing was published")
     data = np.ascontiguousarray(values).tobytes()
     payload[at : at + len(data)] = data
 

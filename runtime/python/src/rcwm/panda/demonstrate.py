@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import time
 from dataclasses import asdict, dataclass
 from pathlib import Path
@@ -11,7 +10,7 @@ from typing import Any
 import numpy as np
 
 from .. import RcwmError
-from ..cli import Progress, write_json
+from ..cli import Progress, claim, write_json
 from ..episode import Episode, EpisodeError, Recorder, read
 from .expert import Expert, Pushes
 from .robot import STREAM_PUSHES, PandaLift, random_stream
@@ -60,7 +59,7 @@ def perform(robot: PandaLift, expert: Expert, layout: int, push: float) -> Episo
 
 def demonstrate(folder: Path, episodes: int, settings: Settings, json_file: Path | None = None) -> dict[str, Any]:
     """Records the layouts 0 to `episodes` - 1; those that are there are read and not done again. Raises `RcwmError`."""
-    _claim(folder, settings)
+    claim(folder, {**asdict(settings), "cameras": list(settings.cameras)}, SETTINGS_FILE)
     robot = settings.robot()
     expert = Expert(robot)
     progress = Progress(episodes, "episodes")
@@ -123,24 +122,6 @@ def measure(episodes: int, settings: Settings, plain: bool = False, json_file: P
     }
     write_json(json_file, result)
     return result
-
-
-def _claim(folder: Path, settings: Settings) -> None:
-    """A folder holds episodes of one kind: others would be taken for those that were asked for."""
-    path = folder / SETTINGS_FILE
-    text = {**asdict(settings), "cameras": list(settings.cameras)}
-    if path.exists():
-        try:
-            before = json.loads(path.read_text(encoding="utf-8"))
-        except (OSError, ValueError) as error:
-            raise RcwmError(f"{path}: cannot be read ({error}); remove the folder or choose another --out") from None
-        differ = [key for key in text if not isinstance(before, dict) or before.get(key) != text[key]]
-        if differ:
-            raise RcwmError(f"{folder}: holds episodes of other settings ({', '.join(differ)}); choose another --out")
-        return
-    if folder.exists() and (not folder.is_dir() or any(folder.glob("*.npz"))):
-        raise RcwmError(f"{folder}: is no folder of ours ({SETTINGS_FILE} is missing); choose another --out")
-    write_json(path, text)
 
 
 def _recorded(path: Path, robot: PandaLift) -> Episode:
