@@ -92,8 +92,10 @@ impl Format {
         let limits = self.low.iter().zip(self.high.iter());
         // NaN is within nothing.
         let fits = |(x, (low, high)): (&f32, (&f32, &f32))| {
-            let beyond = beyond * (high - low);
-            low - beyond <= *x && *x <= high + beyond
+            // In f64, where no range is infinitely wide.
+            let (x, low, high) = (f64::from(*x), f64::from(*low), f64::from(*high));
+            let beyond = f64::from(beyond) * (high - low);
+            low - beyond <= x && x <= high + beyond
         };
         action.len() == self.low.len() && action.iter().zip(limits).all(fits)
     }

@@ -92,10 +92,12 @@ impl<'a> Observation<'a> {
         self.is(super::ObservationFlags::MASK_VALID).then(|| &self.payload[block.bytes.clone()])
     }
 
-    /// Whether the executed action is one that a robot can have executed: every component finite and, but for rounding, within its limits.
+    /// Whether the executed action is one that a robot can have executed: every number finite and, but for rounding, within its limits; or
+    /// all zeros at the first of an episode, which say that nothing was executed.
     #[must_use]
     pub fn has_executable_action(&self) -> bool {
-        self.format.is_executable(self.executed())
+        let nothing = self.is(super::ObservationFlags::FIRST) && self.executed().iter().all(|x| *x == 0.0);
+        nothing || self.format.is_executable(self.executed())
     }
 
     /// Whether every number in it is finite and the executed action in range; nothing else may reach a policy.

@@ -13,12 +13,13 @@ use crate::realtime::{self, Granted, Request};
 #[derive(Debug, Args)]
 #[command(next_help_heading = "When things go wrong")]
 pub(super) struct SafetyArguments {
-    /// What is sent when the policy has nothing fit to send: hold (the action executed last), zero (no motion, where actions are
-    /// displacements or velocities; refused where they are positions), or four numbers
+    /// What is sent when the policy has nothing fit to send: what the robot's interface says of each number, hold (the action
+    /// executed last), zero (no motion, where actions are displacements or velocities; refused where they are positions), or the
+    /// numbers of an action in the interface's units
     #[arg(
         long,
-        value_name = "hold|zero|A,B,C,D",
-        default_value = "hold",
+        value_name = "interface|hold|zero|A,B,...",
+        default_value = "interface",
         allow_hyphen_values = true,
         value_parser = |text: &str| text.parse::<Fallback>()
     )]
@@ -44,8 +45,9 @@ pub(super) struct SafetyArguments {
     /// The same for the environment branch ("the scene has changed")
     #[arg(long, value_name = "NATS", value_parser = at_least_zero)]
     surprise_environment_max: Option<f32>,
-    /// Largest change of any component of the action from what was executed last; the bundle's limits hold before it
-    #[arg(long, value_name = "CHANGE", value_parser = at_least_zero)]
+    /// Largest change of any number of the action from what was executed last, as a share of half of its range in the interface; beside
+    /// the interface's own rate_max
+    #[arg(long, value_name = "SHARE", value_parser = at_least_zero)]
     rate_limit: Option<f32>,
 }
 

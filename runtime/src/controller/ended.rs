@@ -29,9 +29,18 @@ pub enum ControllerError {
     /// Zeros are no rest for the policy.
     #[error(
         "--fallback zero would send the robot to the pose of zeros, for the bundle's actions are absolute positions; use \
-         --fallback hold, or name a pose as four numbers"
+         --fallback interface, or name a pose as numbers"
     )]
     ZeroIsAPose,
+    /// A number to fall back to is one that the robot may not be commanded.
+    #[error("--fallback: number {at} is {found}, the bundle's actions go from {low} to {high} there")]
+    FallbackLimits {
+        /// From 1 on.
+        at: usize,
+        found: f32,
+        low: f32,
+        high: f32,
+    },
     /// The pose to fall back to has another count of numbers than the policy's actions.
     #[error("--fallback names {found} numbers, the bundle's actions have {expected}")]
     FallbackNumbers { found: usize, expected: usize },
@@ -85,6 +94,7 @@ impl From<&ControllerError> for Ended {
             | ControllerError::NoObservation { .. }
             | ControllerError::Panicked(_)
             | ControllerError::FallbackNumbers { .. }
+            | ControllerError::FallbackLimits { .. }
             | ControllerError::ZeroIsAPose => Self::Failed,
         }
     }

@@ -113,7 +113,7 @@ impl Controller {
     /// Connects.
     ///
     /// # Errors
-    /// [`ControllerError::Link`], or [`ControllerError::ZeroIsAPose`].
+    /// [`ControllerError::Link`], or what is wrong with the fallback.
     pub fn open(policy: Policy, settings: ControllerSettings) -> Result<Self, ControllerError> {
         // What is wrong with the settings is said before anybody is connected to.
         let filter = safety_filter(&policy, &settings)?;
@@ -125,7 +125,7 @@ impl Controller {
     /// A controller on a transport that is open.
     ///
     /// # Errors
-    /// [`ControllerError::ZeroIsAPose`].
+    /// What is wrong with the fallback.
     pub fn on(
         link: Box<dyn Transport>,
         policy: Policy,
@@ -383,6 +383,14 @@ fn safety_filter(policy: &Policy, settings: &ControllerSettings) -> Result<Safet
         Fallback::Given(action) if action.len() != limits.numbers() => {
             let (found, expected) = (action.len(), limits.numbers());
             return Err(ControllerError::FallbackNumbers { found, expected });
+        }
+        Fallback::Given(action) => {
+            // Brought into the limits it would be another pose than the one that was thought safe.
+            let within = |at: &usize| (limits.low[*at]..=limits.high[*at]).contains(&action[*at]);
+            if let Some(at) = (0..action.len()).find(|at| !within(at)) {
+                let (low, high) = (limits.low[at], limits.high[at]);
+                return Err(ControllerError::FallbackLimits { at: at + 1, found: action[at], low, high });
+            }
         }
         _ => {}
     }

@@ -5,13 +5,15 @@ use std::str::FromStr;
 use rcwm_models::wire::{ActionValues, Observation, ObservationFlags};
 use serde::{Deserialize, Serialize};
 
-use crate::policy::ActionLimits;
+use crate::policy::{ActionLimits, Safe};
 
 /// What is sent when the policy has nothing fit to send.
 #[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
 #[serde(rename_all = "lowercase")]
 #[expect(clippy::large_enum_variant, reason = "copied by a loop that must not allocate")]
 pub enum Fallback {
+    /// What the interface says of each action: hold, what was measured, zero, or numbers.
+    Interface,
     /// The action that the robot executed last, or was sent last if that is later.
     Hold,
     /// Zeros: no motion where actions are displacements or velocities, the gripper half closed. Holds where they are positions.
@@ -25,6 +27,7 @@ impl FromStr for Fallback {
 
     fn from_str(text: &str) -> Result<Self, String> {
         match text {
+            "interface" => return Ok(Self::Interface),
             "hold" => return Ok(Self::Hold),
             "zero" => return Ok(Self::Zero),
             _ => {}
@@ -32,7 +35,7 @@ impl FromStr for Fallback {
         let values: Result<Vec<f32>, _> = text.split(',').map(|value| value.trim().parse()).collect();
         match values.ok().and_then(|values| ActionValues::of(&values)) {
             Some(action) if action.is_finite() => Ok(Self::Given(action)),
-            _ => Err("expected hold, zero, or the finite numbers of an action as in 0,0,0,-1".into()),
+            _ => Err("expected interface, hold, zero, or the finite numbers of an action as in 0,0,0,-1".into()),
         }
     }
 }
@@ -52,21 +55,24 @@ pub struct Passed {
 #[derive(Debug, Clone, Copy)]
 pub struct SafetyFilter {
     limits: ActionLimits,
-    /// Beside that of the limits.
+    /// Beside that of the limits, as a share of half of each number's range.
     rate_max: Option<f32>,
     /// What the robot executes as far as is known: executed as the last observation says, or sent since.
     held: Option<ActionValues>,
     /// What was sent last in this episode.
     sent: Option<ActionValues>,
+    /// What was measured last of what each number moves; NaN where nothing is.
+    measured: Option<ActionValues>,
 }
 
 impl SafetyFilter {
-    /// A safety filter with the limits of a bundle; with `rate_max`, no component moves by more than that from what was executed last.
+    /// A safety filter with the limits of a bundle; with `rate_max`, no number moves by more than that share of half of its range from
+    /// what was executed last.
     #[must_use]
     pub fn new(limits: ActionLimits, rate_max: Option<f32>) -> Self {
         // Written so that NaN allows no motion.
         let rate_max = rate_max.map(|rate_max| rate_max.max(0.0));
-        Self { limits, rate_max, held: None, sent: None }
+        Self { limits, rate_max, held: None, sent: None, measured: None }
     }
 
     /// Another policy, with limits of its own. What was executed and sent was executed and sent.
@@ -77,22 +83,34 @@ impl SafetyFilter {
     /// A new observation, the first of an episode or where the controller joined one: takes over what the robot has executed. An
     /// observation that is refused tells nothing, unless nothing else is known.
     pub fn observed(&mut self, observation: &Observation<'_>, is_first: bool) {
-        let absolute = self.limits.absolute != 0;
+        let starts = observation.is(ObservationFlags::FIRST);
         if is_first {
             self.sent = None;
-            if !absolute && observation.is(ObservationFlags::FIRST) {
+            if self.limits.absolute == 0 && starts {
                 // A motion ends with its episode; a position is held. Where the first observation was lost, or the controller has
                 // joined another publisher, nothing says that the robot rests.
                 self.held = None;
             }
         }
-        let executed = observation.executed_action();
-        // Zeros at a first observation say that nothing was executed, which is no position.
-        let says_nothing =
-            absolute && observation.is(ObservationFlags::FIRST) && executed.iter().all(|x| *x == 0.0);
-        if observation.is_valid() || (self.held.is_none() && observation.has_executable_action()) {
-            self.held = if says_nothing { self.held } else { Some(executed) };
+        if observation.is_valid() {
+            self.measured = measured(observation);
         }
+        let executed = observation.executed_action();
+        if observation.is_valid() || (self.held.is_none() && observation.has_executable_action()) {
+            // Zeros at a first observation say that nothing was executed, which is no position.
+            let says_nothing = starts && executed.iter().all(|x| *x == 0.0);
+            self.held = if says_nothing { self.at_rest() } else { Some(executed) };
+        }
+    }
+
+    /// Where nothing was executed yet: no motion, and each position as it was measured, or held before; none where one of them is not known.
+    fn at_rest(&self) -> Option<ActionValues> {
+        let position = |i: usize| {
+            let measured = self.measured.map(|measured| measured[i]).filter(|x| x.is_finite());
+            measured.or(self.held.map(|held| held[i]))
+        };
+        let number = |i: usize| if self.limits.is_absolute(i) { position(i) } else { Some(0.0) };
+        (0..self.limits.numbers()).map(number).collect()
     }
 
     /// What the robot goes on with when nothing else is sent: what it executed last. Before anything is known, no motion; none where
@@ -112,7 +130,20 @@ impl SafetyFilter {
                 let rest = |i: usize| if self.limits.is_absolute(i) { held[i] } else { 0.0 };
                 ActionValues::from_fn(held.len(), rest)
             }),
+            Fallback::Interface => (0..self.limits.numbers()).map(|i| self.safe(i)).collect(),
             Fallback::Given(action) => Some(action),
+        }
+    }
+
+    /// What the interface says of one number; what was measured is held where there is such a thing.
+    fn safe(&self, i: usize) -> Option<f32> {
+        let held = || self.held().map(|held| held[i]);
+        match self.limits.safe[i] {
+            Safe::Number(number) => Some(number),
+            Safe::Hold => held(),
+            Safe::HoldMeasured => {
+                self.measured.map(|measured| measured[i]).filter(|x| x.is_finite()).or_else(held)
+            }
         }
     }
 
@@ -132,7 +163,8 @@ impl SafetyFilter {
         // What was sent last may be executed only after the observation that is answered now: near it too, where that is possible.
         let sent = self.sent.unwrap_or(held);
         ActionValues::from_fn(action.len(), |i| {
-            let rate_max = self.limits.rate_max[i].min(self.rate_max.unwrap_or(f32::INFINITY));
+            let given = self.rate_max.map_or(f32::INFINITY, |share| share * self.limits.half_range[i]);
+            let rate_max = self.limits.rate_max[i].min(given);
             if rate_max == f32::INFINITY {
                 return action[i];
             }
@@ -152,8 +184,25 @@ impl SafetyFilter {
     }
 }
 
+/// What the robot says of where each number of an action is; NaN where its interface names no state for it.
+fn measured(observation: &Observation<'_>) -> Option<ActionValues> {
+    let robot = observation.format().interface();
+    if robot.action.iter().all(|action| action.measured.is_none()) {
+        return None;
+    }
+    let state = observation.state();
+    let of = |action: &rcwm_models::interface::Action, at: usize| {
+        let range = action.measured.as_deref().and_then(|name| robot.state_range(name));
+        range.and_then(|range| state.get(range.start + at).copied()).unwrap_or(f32::NAN)
+    };
+    let each = robot.action.iter().flat_map(|action| (0..action.elements.len()).map(move |at| of(action, at)));
+    Some(each.collect())
+}
+
 #[cfg(test)]
 mod tests {
+    use rcwm_models::bundle::{ActionMode, Bundle};
+    use rcwm_models::interface::{Fallback as InterfaceFallback, FallbackRule, Interface};
     use rcwm_models::wire::{Format, OwnedObservation};
 
     use super::*;
@@ -162,13 +211,7 @@ mod tests {
     const HIGH: [f32; 4] = [1.0, 0.5, 1.0, 1.0];
 
     fn limits(absolute: bool) -> ActionLimits {
-        let rate_max = [f32::INFINITY; 4].into();
-        ActionLimits {
-            low: LOW.into(),
-            high: HIGH.into(),
-            rate_max,
-            absolute: if absolute { 0b1111 } else { 0 },
-        }
+        ActionLimits { absolute: if absolute { 0b1111 } else { 0 }, ..ActionLimits::for_tests(LOW, HIGH) }
     }
 
     fn safety_filter(rate_max: Option<f32>) -> SafetyFilter {
@@ -357,5 +400,62 @@ mod tests {
         assert!(filter.fallback(Fallback::Zero).is_none(), "no place of the gripper is known");
         filter.observed(&executed([0.5, 0.4, 0.3, 0.7]).view(), true);
         assert_eq!(filter.fallback(Fallback::Zero).unwrap(), [0.0, 0.0, 0.0, 0.7]);
+    }
+
+    /// An arm of two joints in radians that is measured, beside a gripper that is not.
+    fn arm() -> (ActionLimits, std::sync::Arc<Format>) {
+        let mut interface = Interface::parse(include_str!("../../../models/src/interface/arm.toml")).unwrap();
+        interface.action[0].low[1] = -3.0;
+        interface.action[0].high[1] = -0.1;
+        let mut gripper = interface.action[0].clone();
+        (gripper.name, gripper.mode, gripper.unit) = ("gripper".into(), ActionMode::Velocity, "m/s".into());
+        (gripper.elements, gripper.low, gripper.high) = (vec!["width".into()], vec![-0.1], vec![0.1]);
+        (gripper.measured, gripper.rate_max, gripper.fallback) =
+            (None, None, InterfaceFallback::Rule(FallbackRule::Zero));
+        interface.action.push(gripper);
+        let mut manifest = Bundle::open(&rcwm_models_bundle()).unwrap().manifest;
+        manifest.interface = interface.clone();
+        (ActionLimits::of(&manifest), Format::of(interface))
+    }
+
+    fn rcwm_models_bundle() -> std::path::PathBuf {
+        std::path::Path::new(env!("CARGO_MANIFEST_DIR")).join("../models/bundles/untrained")
+    }
+
+    #[test]
+    fn the_interface_says_what_is_safe_and_a_measured_arm_starts_from_where_it_stands() {
+        let (limits, format) = arm();
+        let mut filter = SafetyFilter::new(limits, None);
+        assert!(filter.fallback(Fallback::Interface).is_none(), "nothing was measured yet");
+        let mut first = OwnedObservation::zeroed(&format);
+        first.flags = ObservationFlags::FIRST.0;
+        first.edit().state().copy_from_slice(&[0.5, -1.5]);
+        assert!(first.view().is_valid(), "zeros, which the second joint cannot be at, say that nothing was executed");
+        filter.observed(&first.view(), true);
+        assert_eq!(filter.held().unwrap(), [0.5, -1.5, 0.0]);
+        // By no more than rate_max from where it stands.
+        assert_eq!(filter.pass([2.0, -3.0, 0.1].into()).unwrap().action, [0.55, -1.55, 0.1]);
+        filter.sent([0.55, -1.55, 0.1].into());
+        let mut next = OwnedObservation::zeroed(&format);
+        next.edit().executed().copy_from_slice(&[0.55, -1.55, 0.1]);
+        next.edit().state().copy_from_slice(&[0.52, -1.52]);
+        filter.observed(&next.view(), false);
+        assert_eq!(filter.fallback(Fallback::Interface).unwrap(), [0.52, -1.52, 0.0]);
+        assert_eq!(filter.fallback(Fallback::Hold).unwrap(), [0.55, -1.55, 0.1]);
+        // The next episode: the gripper's motion has ended, and the arm is where it is measured.
+        filter.observed(&first.view(), true);
+        assert_eq!(filter.held().unwrap(), [0.5, -1.5, 0.0]);
+    }
+
+    #[test]
+    fn the_given_rate_limit_is_a_share_of_each_range() {
+        let (mut limits, format) = arm();
+        limits.rate_max = [f32::INFINITY; 3].into();
+        let mut filter = SafetyFilter::new(limits, Some(0.5));
+        let mut first = OwnedObservation::zeroed(&format);
+        first.edit().executed().copy_from_slice(&[0.0, -1.5, 0.0]);
+        filter.observed(&first.view(), true);
+        let passed = filter.pass([2.9, -0.1, 0.1].into()).unwrap().action;
+        assert!(passed.iter().zip([1.45, -0.775, 0.05]).all(|(a, b)| (a - b).abs() < 1e-6), "{passed:?}");
     }
 }

@@ -27,12 +27,12 @@ pub struct ControllerSettings {
     pub fallback: Fallback,
     /// How much surprise is borne.
     pub surprise: SurpriseLimits,
-    /// Largest change of an action's component from one action to the next; at least 0.
+    /// Largest change of each number from one action to the next, as a share of half of its range; at least 0.
     pub rate_max: Option<f32>,
 }
 
 impl ControllerSettings {
-    /// Waits for ever, holds the last action as the fallback, and bears any surprise.
+    /// Waits for ever, falls back to what the interface says, and bears any surprise.
     #[must_use]
     pub fn new(link: LinkSettings) -> Self {
         Self {
@@ -43,7 +43,7 @@ impl ControllerSettings {
             silence_max: None,
             pacing: PacingSettings::default(),
             ticks: TickLimits::default(),
-            fallback: Fallback::Hold,
+            fallback: Fallback::Interface,
             surprise: SurpriseLimits::default(),
             rate_max: None,
         }

@@ -152,6 +152,8 @@ impl Controller {
         let inputs = self.inputs.read(observation).filter(|_| observation.is_valid());
         let Some(inputs) = inputs else {
             self.counters.refused_observations += 1;
+            // What is seen next is the first that the policy sees of this episode.
+            self.fresh_policy |= is_first;
             return (None, Event::Invalid(Cause::Observation));
         };
         // A new policy starts where it takes over, as at the first of an episode.

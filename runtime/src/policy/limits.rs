@@ -1,7 +1,20 @@
-//! The last thing that happens to an action.
+//! What a robot may be commanded, number by number.
 
 use rcwm_models::bundle::{ActionMode, Manifest};
-use rcwm_models::wire::ActionValues;
+use rcwm_models::interface::{Action, Fallback, FallbackRule};
+use rcwm_models::wire::{ACTION_NUMBERS_MAX, ActionValues};
+
+/// What a number of an action is where there is no decision.
+#[derive(Debug, Clone, Copy, PartialEq, Default)]
+pub enum Safe {
+    /// What was executed last.
+    #[default]
+    Hold,
+    /// What was measured last.
+    HoldMeasured,
+    /// This, in units.
+    Number(f32),
+}
 
 /// What each number of an action may be, in the interface's units.
 #[derive(Debug, Clone, Copy, PartialEq)]
@@ -14,6 +27,10 @@ pub struct ActionLimits {
     pub rate_max: ActionValues,
     /// One bit a number: it is a position, of which zero is one like any other.
     pub absolute: u64,
+    /// Half of the interface's range.
+    pub half_range: ActionValues,
+    /// The interface's fallback.
+    pub safe: [Safe; ACTION_NUMBERS_MAX],
 }
 
 impl ActionLimits {
@@ -30,6 +47,8 @@ impl ActionLimits {
             high: limits.high.into_iter().collect(),
             rate_max: each.map(|action| rate_max(action.rate_max)).collect(),
             absolute: absolute.fold(0, |bits, (at, _)| bits | 1 << at),
+            half_range: actions.iter().flat_map(half_ranges).collect(),
+            safe: safe(actions),
         }
     }
 
@@ -52,18 +71,45 @@ impl ActionLimits {
     }
 }
 
+fn half_ranges(action: &Action) -> impl Iterator<Item = f32> {
+    action.low.iter().zip(&action.high).map(|(low, high)| (0.5 * (high - low)) as f32)
+}
+
+fn safe(actions: &[Action]) -> [Safe; ACTION_NUMBERS_MAX] {
+    let of = |action: &Action, at: usize| match &action.fallback {
+        Fallback::Rule(FallbackRule::Hold) => Safe::Hold,
+        Fallback::Rule(FallbackRule::HoldMeasured) => Safe::HoldMeasured,
+        Fallback::Rule(FallbackRule::Zero) => Safe::Number(0.0),
+        Fallback::Numbers(numbers) => Safe::Number(numbers[at] as f32),
+    };
+    let mut all = [Safe::default(); ACTION_NUMBERS_MAX];
+    let each = actions.iter().flat_map(|action| (0..action.elements.len()).map(move |at| of(action, at)));
+    all.iter_mut().zip(each).for_each(|(to, safe)| *to = safe);
+    all
+}
+
+#[cfg(test)]
+impl ActionLimits {
+    /// Displacements within these limits, of an interface of -1 to 1 that holds.
+    pub(crate) fn for_tests(low: [f32; 4], high: [f32; 4]) -> Self {
+        Self {
+            low: low.into(),
+            high: high.into(),
+            rate_max: [f32::INFINITY; 4].into(),
+            absolute: 0,
+            half_range: [1.0; 4].into(),
+            safe: [Safe::Hold; ACTION_NUMBERS_MAX],
+        }
+    }
+}
+
 #[cfg(test)]
 mod tests {
     use super::*;
 
     #[test]
     fn no_action_leaves_the_limits() {
-        let limits = ActionLimits {
-            low: [-1.0, -0.5, 0.25, -1.0].into(),
-            high: [1.0, 0.5, 0.75, 1.0].into(),
-            rate_max: [f32::INFINITY; 4].into(),
-            absolute: 0,
-        };
+        let limits = ActionLimits::for_tests([-1.0, -0.5, 0.25, -1.0], [1.0, 0.5, 0.75, 1.0]);
         assert_eq!(limits.clamp([2.0, -2.0, 0.0, 0.5].into()), [1.0, -0.5, 0.25, 0.5]);
         let odd = limits.clamp([f32::INFINITY, f32::NEG_INFINITY, 0.5, f32::NAN].into());
         assert_eq!(odd[..3], [1.0, -0.5, 0.5]);

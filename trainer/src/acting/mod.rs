@@ -27,12 +27,12 @@ pub fn check_acting(model: &ModelSettings, started: bool) -> Result<(), Settings
     let action = if started { arm } else { model.action };
     let needed =
         [("image_side", model.image_side, 64), ("cameras", model.cameras, 1), ("state", model.state, 0)];
-    let wrong = needed.into_iter().chain([("action", model.action, action)]);
-    for (name, found, expected) in wrong.filter(|(_, found, expected)| found != expected) {
-        return Err(SettingsError::Invalid(format!(
+    let mut sizes = needed.into_iter().chain([("action", model.action, action)]);
+    match sizes.find(|(_, found, expected)| found != expected) {
+        Some((name, found, expected)) => Err(SettingsError::Invalid(format!(
             "model.{name} = {found}, acting in simulators takes {expected}; learn from recorded data (pretrain, fewshot) and deploy \
              the bundle with rcwm-runtime"
-        )));
+        ))),
+        None => Ok(()),
     }
-    Ok(())
 }

@@ -114,10 +114,11 @@ impl Scenario {
 fn setup(rng: &mut ChaCha8Rng, bundles: usize) -> Setup {
     let lockstep = rng.random_bool(0.5);
     let any = |rng: &mut ChaCha8Rng, of: &[Option<f32>]| of.choose(rng).copied().flatten();
-    let fallback = match rng.random_range(0..4) {
+    let fallback = match rng.random_range(0..5) {
         0 | 1 => Fallback::Hold,
         2 => Fallback::Zero,
-        _ => Fallback::Given(ActionValues::from_fn(rcwm_models::ACTION_LEN, |_| rng.random_range(-1.5..1.5))),
+        3 => Fallback::Interface,
+        _ => Fallback::Given(ActionValues::from_fn(rcwm_models::ACTION_LEN, |_| rng.random_range(-1.0..1.0))),
     };
     let surprise = rng.random_bool(0.2);
     let nats = [None, Some(0.0), Some(0.5), Some(20.0)];

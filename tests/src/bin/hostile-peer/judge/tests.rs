@@ -3,10 +3,10 @@
 use std::time::Duration;
 
 use rcwm_models::ACTION_LEN;
-use rcwm_models::wire::{ActionSource, Format, OwnedObservation};
+use rcwm_models::wire::{ACTION_NUMBERS_MAX, ActionSource, Format, OwnedObservation};
 use rcwm_runtime::controller::{Fallback, SurpriseLimits, TickLimits};
 use rcwm_runtime::pacing::PacingSettings;
-use rcwm_runtime::policy::ActionLimits;
+use rcwm_runtime::policy::{ActionLimits, Safe};
 
 use super::due::LOOKS_MAX;
 use super::*;
@@ -14,7 +14,14 @@ use super::*;
 const PERIOD_NS: u64 = 1_000_000;
 fn limits(low: f32, high: f32) -> ActionLimits {
     let all = |x: f32| [x; ACTION_LEN].into();
-    ActionLimits { low: all(low), high: all(high), rate_max: all(f32::INFINITY), absolute: 0 }
+    ActionLimits {
+        low: all(low),
+        high: all(high),
+        rate_max: all(f32::INFINITY),
+        absolute: 0,
+        half_range: all(1.0),
+        safe: [Safe::Hold; ACTION_NUMBERS_MAX],
+    }
 }
 
 fn setup() -> Setup {

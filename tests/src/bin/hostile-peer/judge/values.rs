@@ -80,8 +80,8 @@ impl Judge {
         let holds = || self.bases.iter().any(|base| self.is_made_of(action, base));
         let fits = match self.setup.fallback {
             Fallback::Hold => holds(),
-            // Zeros are no rest where actions are positions.
-            Fallback::Zero => {
+            // Zeros are no rest where actions are positions; so do our interfaces say it.
+            Fallback::Zero | Fallback::Interface => {
                 let any = |absolute: bool| self.running.iter().any(|running| running.is_absolute == absolute);
                 any(true) && holds() || any(false) && self.is_made_of(action, &[0.0; ACTION_LEN].into())
             }
