@@ -1,6 +1,7 @@
 use std::sync::atomic::{AtomicBool, Ordering};
 use std::time::Duration;
 
+use rcwm_models::IMAGE_SIDE;
 use rcwm_models::interface::{ActionMode, Interface, Mismatch};
 use rcwm_models::wire::{
     Action, ActionSource, ActionValues, ControllerLink, LinkError, LinkSettings, ObservationSample, Wait,
@@ -30,8 +31,8 @@ pub struct Client {
     answer: Option<Action>,
 }
 
-/// What the trainer needs of a robot that it acts on: commands of which zeros are no motion, and that may change at once. Whatever else it
-/// offers is recorded.
+/// What the trainer needs of a robot that it acts on: a first camera of the size that it acts on, commands of which zeros are no motion,
+/// and that may change at once. Whatever else it offers is recorded.
 fn needs(robot: &Interface) -> Vec<Mismatch> {
     let mut found = Vec::new();
     for action in &robot.action {
@@ -43,6 +44,18 @@ fn needs(robot: &Interface) -> Vec<Mismatch> {
         if action.rate_max.is_some() {
             found.push(Mismatch::new(&place, "it has a rate_max, which the trainer does not keep"));
         }
+    }
+    let picture = [IMAGE_SIDE, IMAGE_SIDE, 3];
+    match robot.camera.first() {
+        None => found.push(Mismatch::new("camera", "there is none, and the trainer acts by what it sees")),
+        Some(camera) if camera.shape != picture => {
+            let [height, width, _] = camera.shape;
+            let text = format!(
+                "{height} x {width}, the trainer acts on {IMAGE_SIDE} x {IMAGE_SIDE}; resize on the robot's side"
+            );
+            found.push(Mismatch::new(&format!("camera {}", camera.name), text));
+        }
+        Some(_) => {}
     }
     found
 }
