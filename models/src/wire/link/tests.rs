@@ -10,7 +10,7 @@ use crate::interface::{Interface, Mismatch};
 use crate::wire::{Action, ActionHeader, Format, ObservationHeader};
 
 /// Settings under a prefix of their own, which is forgotten at the end.
-struct Domain(LinkSettings);
+pub(in crate::wire) struct Domain(LinkSettings);
 
 impl Drop for Domain {
     fn drop(&mut self) {
@@ -18,15 +18,15 @@ impl Drop for Domain {
     }
 }
 
-fn domain(name: &str) -> (LinkSettings, Domain) {
+pub(in crate::wire) fn domain(name: &str) -> (LinkSettings, Domain) {
     let prefix = Some(format!("rcwm_unit_{}_{name}_", std::process::id()));
     let settings = LinkSettings { instance: name.to_owned(), prefix, spin: Duration::ZERO };
     (settings.clone(), Domain(settings))
 }
 
-const SOON: Duration = Duration::from_secs(5);
+pub(in crate::wire) const SOON: Duration = Duration::from_secs(5);
 
-fn anything(_: &Interface) -> Vec<Mismatch> {
+pub(in crate::wire) fn anything(_: &Interface) -> Vec<Mismatch> {
     Vec::new()
 }
 
@@ -39,7 +39,7 @@ fn pair(settings: &LinkSettings, format: &Arc<Format>) -> (SimulatorLink, Contro
     (simulator, controller)
 }
 
-fn arm() -> Arc<Format> {
+pub(in crate::wire) fn arm() -> Arc<Format> {
     Format::of(Interface::parse(include_str!("../../interface/arm.toml")).unwrap())
 }
 
