@@ -11,11 +11,12 @@ use rcwm_lab::film::film;
 use rcwm_lab::log::{LoggedLatencies, ReplayError, ReplayReport, Replayer, write_episodes};
 use rcwm_lab::plot::{Curve, plot};
 use rcwm_models::bundle::Bundle;
-use rcwm_models::wire::{ActionSource, Format, ObservationFlags, OwnedObservation};
+use rcwm_models::interface::Interface;
+use rcwm_models::wire::{ActionSource, ActionValues, Format, ObservationFlags, OwnedObservation};
 
 use rcwm_runtime::EngineSettings;
 use rcwm_runtime::controller::Fallback;
-use rcwm_runtime::log::frames::{FrameReader, MAGIC, Next, write_frame, write_start};
+use rcwm_runtime::log::frames::{FrameReader, MAGIC, Next, PAYLOAD_BYTES_MAX, write_frame, write_start};
 use rcwm_runtime::log::pack::{ImagePacker, PackedMask};
 use rcwm_runtime::log::{
     Answer, BundleIdentity, DIGEST_BYTES, Header, LogError, LogReader, LoggedCall, LoggedOutcome, Machine,
@@ -128,13 +129,20 @@ fn interface() -> Record {
 }
 
 fn of_records(change: impl FnOnce(&mut Header, &mut Vec<TickRecord>)) -> Result<ReplayReport, ReplayError> {
+    of_records_after(vec![interface()], change)
+}
+
+/// The same with other records before the ticks.
+fn of_records_after(
+    mut records: Vec<Record>,
+    change: impl FnOnce(&mut Header, &mut Vec<TickRecord>),
+) -> Result<ReplayReport, ReplayError> {
     let bundle = Bundle::open(&bundle()).unwrap();
     let mut header = header(&bundle);
     let mut images = ImagePacker::default();
     let mut ticks = (0..4).map(|step| tick(&mut images, step, None)).collect();
     change(&mut header, &mut ticks);
-    let records = ticks.into_iter().map(|tick| Record::Tick(Box::new(tick)));
-    let records: Vec<_> = std::iter::once(interface()).chain(records).collect();
+    records.extend(ticks.into_iter().map(|tick| Record::Tick(Box::new(tick))));
     let folder = tempfile::tempdir().unwrap();
     let path = folder.path().join("crafted.rcwmlog");
     write(&path, &payloads(&header, &records));
@@ -203,6 +211,80 @@ fn actions_that_are_no_numbers_do_not_reach_the_safety_filter() {
         });
         assert!(report.unwrap().ticks_differing > 0);
     }
+}
+
+/// What is said of a log that is read up to a damage after `ticks` ticks.
+fn damage_after(ticks: u64, report: Result<ReplayReport, ReplayError>) -> String {
+    let report = report.unwrap();
+    assert_eq!(report.ticks, ticks, "{:?}", report.log_damage);
+    report.log_damage.unwrap()
+}
+
+#[test]
+fn actions_of_another_count_of_numbers_than_the_bundle_s_are_named_and_end_the_log() {
+    for count in [0, 3, 5, 64] {
+        let other = || ActionValues::zeros(count);
+        let changes: [&dyn Fn(&mut TickRecord); 3] =
+            [&|tick| tick.answer.action = other(), &|tick| tick.calls[1].action = Some(other()), &|tick| {
+                match &mut tick.calls[0].outcome {
+                    LoggedOutcome::Decided { action, .. } => *action = other(),
+                    _ => unreachable!(),
+                }
+            }];
+        for change in changes {
+            let said = damage_after(2, of_records(|_, ticks| change(&mut ticks[2])));
+            assert!(said.contains(&format!("{count} numbers, expected 4")), "{said}");
+            assert!(said.contains("log the run again"), "{said}");
+        }
+    }
+    // Nothing was sent, and there was nothing to send.
+    let report = of_records(|_, ticks| {
+        (ticks[2].overtaken, ticks[2].answer.action) = (true, ActionValues::zeros(0));
+    });
+    assert_eq!(report.unwrap().log_damage, None);
+}
+
+#[test]
+fn a_header_with_other_counts_of_numbers_than_the_bundle_s_actions_is_said() {
+    let refused = |change: &dyn Fn(&mut Header)| {
+        let error = of_records(|header, _| change(header)).unwrap_err();
+        let ReplayError::Log(LogError::NotALog { reason, .. }) = error else { panic!("{error}") };
+        reason
+    };
+    for count in [0, 3, 5] {
+        let said = refused(&|header| header.fallback = Fallback::Given(ActionValues::zeros(count)));
+        assert!(said.contains(&format!("fallback of {count} numbers, expected 4")), "{said}");
+    }
+    for (low, high) in [(4, 3), (0, 0), (65, 65)] {
+        let said = refused(&|header| {
+            let limits = &mut header.bundle.action_limits;
+            (limits.low, limits.high) = (vec![-1.0; low], vec![1.0; high]);
+        });
+        assert!(said.contains(&format!("{low} lowest and {high} highest")), "{said}");
+    }
+    let said = refused(&|header| header.instance = "../../etc/passwd".into());
+    assert!(said.contains("instance"), "{said}");
+}
+
+#[test]
+fn an_interface_or_a_policy_of_another_count_of_action_numbers_ends_the_log() {
+    let mut other = Interface::metaworld();
+    let action = &mut other.action[0];
+    action.elements.push("more".into());
+    (action.low.push(-1.0), action.high.push(1.0));
+    let said = damage_after(0, of_records_after(vec![Record::Interface(other.canonical())], |_, _| ()));
+    assert!(said.contains("5 numbers, expected 4"), "{said}");
+    let mut identity = BundleIdentity::of(&Bundle::open(&bundle()).unwrap().manifest);
+    identity.action_limits.low.pop();
+    identity.action_limits.high.pop();
+    let said = damage_after(0, of_records_after(vec![interface(), Record::Policy(identity)], |_, _| ()));
+    assert!(said.contains("3 numbers, expected 4"), "{said}");
+}
+
+#[test]
+fn interfaces_in_a_row_however_many_do_not_overflow_the_stack() {
+    let report = of_records_after((0..20_000).map(|_| interface()).collect(), |_, _| ()).unwrap();
+    assert_eq!((report.ticks, report.log_damage), (4, None));
 }
 
 #[test]
@@ -274,4 +356,15 @@ fn what_was_written_is_read_back_frame_by_frame() {
     let mut frames = FrameReader::new(&bytes[MAGIC.len() + 4..], 0);
     assert!(matches!(frames.read().unwrap(), Next::Payload(b"abc")));
     assert!(matches!(frames.read().unwrap(), Next::End));
+}
+
+#[test]
+fn a_frame_that_could_not_be_read_back_is_not_written() {
+    let mut bytes = Vec::new();
+    let largest = vec![0; PAYLOAD_BYTES_MAX];
+    write_frame(&mut bytes, &largest).unwrap();
+    assert!(matches!(FrameReader::new(&bytes[..], 0).read().unwrap(), Next::Payload(_)));
+    bytes.clear();
+    let said = write_frame(&mut bytes, &[largest, vec![0]].concat()).unwrap_err().to_string();
+    assert!(bytes.is_empty() && said.contains(&format!("at most {PAYLOAD_BYTES_MAX}")), "{said}");
 }

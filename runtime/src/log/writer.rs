@@ -10,10 +10,10 @@ use rcwm_models::wire::{Format, Observation};
 
 use super::LogError;
 use super::frames::{MAGIC, write_frame, write_start};
+use super::header::{BundleIdentity, Header, Machine};
 use super::pack::{ImagePacker, PackedMask};
 use super::record::{
-    BundleIdentity, Header, KEYFRAME_TICKS, LoggedCall, LoggedOutcome, Machine, Observed, Record, TickRecord,
-    WholeState, digest,
+    KEYFRAME_TICKS, LoggedCall, LoggedOutcome, Observed, Record, TickRecord, WholeState, digest,
 };
 use crate::controller::Fallback;
 use crate::engine::EngineSettings;
