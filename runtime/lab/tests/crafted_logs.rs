@@ -2,8 +2,11 @@
 
 #![allow(clippy::unwrap_used, reason = "a test that fails panics")]
 
+mod crafted;
+
 use std::path::{Path, PathBuf};
 
+use crafted::{header, payloads, write};
 use rand::seq::IndexedRandom;
 use rand::{Rng, SeedableRng};
 use rand_chacha::ChaCha8Rng;
@@ -12,43 +15,27 @@ use rcwm_lab::log::{LoggedLatencies, ReplayError, ReplayReport, Replayer, write_
 use rcwm_lab::plot::{Curve, plot};
 use rcwm_models::bundle::Bundle;
 use rcwm_models::interface::Interface;
-use rcwm_models::wire::{ActionSource, ActionValues, Format, ObservationFlags, OwnedObservation};
+use rcwm_models::wire::{ActionValues, Format, ObservationFlags, OwnedObservation};
 
 use rcwm_runtime::EngineSettings;
 use rcwm_runtime::controller::Fallback;
 use rcwm_runtime::log::frames::{FrameReader, MAGIC, Next, PAYLOAD_BYTES_MAX, write_frame, write_start};
-use rcwm_runtime::log::pack::{ImagePacker, PackedMask};
+use rcwm_runtime::log::pack::ImagePacker;
 use rcwm_runtime::log::{
-    Answer, BundleIdentity, DIGEST_BYTES, Header, LogError, LogReader, LoggedCall, LoggedOutcome, Machine,
-    Observed, Record, TickRecord, WholeState,
+    BundleIdentity, Header, LogError, LogReader, LoggedCall, LoggedOutcome, Record, TickRecord, WholeState,
 };
-use rcwm_runtime::policy::{BranchState, CallKind, Policy, STAGES, Sampling, State};
+use rcwm_runtime::policy::{BranchState, CallKind, Policy, STAGES, State};
 use rcwm_runtime::telemetry::Stage;
 
 fn bundle() -> PathBuf {
     Path::new(env!("CARGO_MANIFEST_DIR")).join("../../models/bundles/untrained")
 }
 
-fn header(bundle: &Bundle) -> Header {
-    Header {
-        program: "test".into(),
-        started_unix_s: 0,
-        instance: "test".into(),
-        bundle: BundleIdentity::of(&bundle.manifest),
-        engine: EngineSettings::tract(),
-        sampling: Sampling::Sample { seed: 1 },
-        fallback: Fallback::Hold,
-        rate_max: Some(0.1),
-        stages: Vec::new(),
-        machine: Machine::here(),
-    }
-}
-
 fn state_of(policy: &Policy) -> (State, u128) {
     (policy.state().clone(), 0)
 }
 
-fn tick(images: &mut ImagePacker, step: u32, state: Option<WholeState>) -> TickRecord {
+fn tick(images: &mut [ImagePacker], step: u32, state: Option<WholeState>) -> TickRecord {
     let mut observation = OwnedObservation::zeroed(&Format::metaworld());
     (observation.step, observation.sequence) = (step, u64::from(step));
     observation.flags = ObservationFlags::default()
@@ -56,52 +43,19 @@ fn tick(images: &mut ImagePacker, step: u32, state: Option<WholeState>) -> TickR
         .with(ObservationFlags::MASK_VALID, true)
         .0;
     observation.edit().image(0)[step as usize] = 200;
-    let observation = observation.view();
-    let image = images.pack(observation.image(0), step == 0);
-    let mask = observation.mask(0).map(PackedMask::pack);
     let action = (step > 0).then_some([0.1; 4].into());
     let (outcome, stage_ns) = ([0.1; 4].into(), vec![1; STAGES.len()]);
     let decided = LoggedOutcome::Decided { action: outcome, recomputed: false, surprise: None, stage_ns };
-    TickRecord {
-        dropped_before: 0,
-        resumes: state.is_some(),
-        is_first: step == 0,
-        observed: Some(Observed::of(&observation, vec![image], vec![mask])),
-        scheduled_ns: 10,
-        received_ns: 20,
-        overtaken: false,
-        calls: vec![
-            LoggedCall { kind: CallKind::Observe, action, outcome: decided },
-            LoggedCall {
-                kind: CallKind::WorkAhead,
-                action: Some([0.1; 4].into()),
-                outcome: LoggedOutcome::Done(5),
-            },
-        ],
-        answer: Answer {
-            answers: u64::from(step),
-            published_ns: 30,
-            source: ActionSource::Policy as u32,
-            action: [0.1; 4].into(),
+    let calls = vec![
+        LoggedCall { kind: CallKind::Observe, action, outcome: decided },
+        LoggedCall {
+            kind: CallKind::WorkAhead,
+            action: Some([0.1; 4].into()),
+            outcome: LoggedOutcome::Done(5),
         },
-        digest: [0; DIGEST_BYTES],
-        state,
-    }
-}
-
-fn payloads(header: &Header, records: &[Record]) -> Vec<Vec<u8>> {
-    let header = serde_json::to_vec(header).unwrap();
-    let records = records.iter().map(|record| postcard::to_allocvec(record).unwrap());
-    std::iter::once(header).chain(records).collect()
-}
-
-fn write(path: &Path, payloads: &[Vec<u8>]) {
-    let mut bytes = Vec::new();
-    write_start(&mut bytes).unwrap();
-    for payload in payloads {
-        write_frame(&mut bytes, payload).unwrap();
-    }
-    std::fs::write(path, bytes).unwrap();
+    ];
+    let resumes = state.is_some();
+    TickRecord { resumes, calls, state, ..crafted::tick(images, &observation, [0.1; 4].into()) }
 }
 
 /// Everything that the tools do with a log; the replay's report where it came so far.
@@ -138,8 +92,8 @@ fn of_records_after(
     change: impl FnOnce(&mut Header, &mut Vec<TickRecord>),
 ) -> Result<ReplayReport, ReplayError> {
     let bundle = Bundle::open(&bundle()).unwrap();
-    let mut header = header(&bundle);
-    let mut images = ImagePacker::default();
+    let mut header = header(BundleIdentity::of(&bundle.manifest));
+    let mut images = [ImagePacker::default()];
     let mut ticks = (0..4).map(|step| tick(&mut images, step, None)).collect();
     change(&mut header, &mut ticks);
     records.extend(ticks.into_iter().map(|tick| Record::Tick(Box::new(tick))));
@@ -317,7 +271,7 @@ fn a_pipe_is_no_log_and_is_not_waited_for() {
 #[test]
 fn bytes_changed_at_random_behind_checksums_that_fit_make_no_tool_panic() {
     let bundle = Bundle::open(&bundle()).unwrap();
-    let mut images = ImagePacker::default();
+    let mut images = [ImagePacker::default()];
     let loaded = Policy::load(&self::bundle(), EngineSettings::tract()).unwrap();
     let whole = |step| (step % 2 == 0).then(|| WholeState::of(loaded.state(), 7));
     let mut records: Vec<_> = std::iter::once(interface())
@@ -325,7 +279,7 @@ fn bytes_changed_at_random_behind_checksums_that_fit_make_no_tool_panic() {
         .collect();
     records.insert(2, Record::Policy(BundleIdentity::of(&bundle.manifest)));
     records.push(Record::End { ticks: 4, dropped: 0 });
-    let sound = payloads(&header(&bundle), &records);
+    let sound = payloads(&header(BundleIdentity::of(&bundle.manifest)), &records);
     let folder = tempfile::tempdir().unwrap();
     let path = folder.path().join("crafted.rcwmlog");
     write(&path, &sound);
