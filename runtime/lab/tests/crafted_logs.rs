@@ -225,7 +225,8 @@ fn an_interface_or_a_policy_of_another_count_of_action_numbers_ends_the_log() {
     let mut other = Interface::metaworld();
     let action = &mut other.action[0];
     action.elements.push("more".into());
-    (action.low.push(-1.0), action.high.push(1.0));
+    action.low.push(-1.0);
+    action.high.push(1.0);
     let said = damage_after(0, of_records_after(vec![Record::Interface(other.canonical())], |_, _| ()));
     assert!(said.contains("5 numbers, expected 4"), "{said}");
     let mut identity = BundleIdentity::of(&Bundle::open(&bundle()).unwrap().manifest);

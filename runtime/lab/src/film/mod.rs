@@ -268,7 +268,7 @@ impl<'a> Filming<'a> {
             Input::I64(&environment.z),
             Input::F32(&environment.h),
         ];
-        Ok(decoder.run(&inputs, &mut decoded.outputs().map(|values| Output::F32(values)))?)
+        Ok(decoder.run(&inputs, &mut decoded.outputs().map(Output::F32))?)
     }
 
     /// Writes the episode that is over.
