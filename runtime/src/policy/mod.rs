@@ -27,7 +27,7 @@ mod tick;
 pub use calls::{CALLS_MAX, Call, CallKind, CallOutcome};
 pub use error::PolicyError;
 pub use inputs::{InputReader, Inputs};
-pub use limits::{ActionLimits, Safe};
+pub use limits::ActionLimits;
 pub use noise::Sampling;
 pub use parts::{BranchBuffers, Buffers};
 pub use state::{BranchState, State, Surprise};

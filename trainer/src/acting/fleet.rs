@@ -101,7 +101,7 @@ impl Fleet {
             clients.push(Client::of(process)?);
         }
         for instance in join {
-            clients.push(Client::join_to_act(instance)?);
+            clients.push(Client::join(instance)?);
         }
         if clients.is_empty() {
             return Err(FleetError::Nobody);

@@ -1,11 +1,11 @@
 use std::sync::atomic::{AtomicBool, Ordering};
 use std::time::Duration;
 
-use rcwm_models::interface::{ActionMode, Camera, Interface, Mismatch};
+use rcwm_models::IMAGE_SIDE;
+use rcwm_models::interface::{ActionMode, Interface, Mismatch};
 use rcwm_models::wire::{
     Action, ActionSource, ActionValues, ControllerLink, LinkError, LinkSettings, ObservationSample, Wait,
 };
-use rcwm_models::{IMAGE_CHANNELS, IMAGE_SIDE};
 
 use super::{ProcessError, SimulatorProcess};
 
@@ -31,8 +31,8 @@ pub struct Client {
     answer: Option<Action>,
 }
 
-/// What the trainer needs of a robot that it acts on: commands of which zeros are no motion, and that may change at once. Whatever else it
-/// offers is recorded.
+/// What the trainer needs of a robot that it acts on: a first camera of the size that it acts on, commands of which zeros are no motion,
+/// and that may change at once. Whatever else it offers is recorded.
 fn needs(robot: &Interface) -> Vec<Mismatch> {
     let mut found = Vec::new();
     for action in &robot.action {
@@ -45,15 +45,18 @@ fn needs(robot: &Interface) -> Vec<Mismatch> {
             found.push(Mismatch::new(&place, "it has a rate_max, which the trainer does not keep"));
         }
     }
-    found
-}
-
-/// What the policy that is trained needs besides: it looks at the first camera.
-fn needs_to_act(robot: &Interface) -> Vec<Mismatch> {
-    let needed = [IMAGE_SIDE, IMAGE_SIDE, IMAGE_CHANNELS].map(|side| side.to_string()).join(" x ");
-    let has = robot.camera.first().map_or_else(|| "none".to_owned(), Camera::size);
-    let mut found = needs(robot);
-    found.extend(Mismatch::between("first camera", "size", &needed, &has));
+    let picture = [IMAGE_SIDE, IMAGE_SIDE, 3];
+    match robot.camera.first() {
+        None => found.push(Mismatch::new("camera", "there is none, and the trainer acts by what it sees")),
+        Some(camera) if camera.shape != picture => {
+            let [height, width, _] = camera.shape;
+            let text = format!(
+                "{height} x {width}, the trainer acts on {IMAGE_SIDE} x {IMAGE_SIDE}; resize on the robot's side"
+            );
+            found.push(Mismatch::new(&format!("camera {}", camera.name), text));
+        }
+        Some(_) => {}
+    }
     found
 }
 
@@ -64,15 +67,9 @@ impl Client {
         Ok(Self { link, process: Some(process), answer: None })
     }
 
-    /// Connects to a simulator that runs, or will, to record it.
+    /// Connects to a simulator that runs, or will.
     pub fn join(instance: &str) -> Result<Self, ClientError> {
         let link = ControllerLink::open(LinkSettings::new(instance), needs)?;
-        Ok(Self { link, process: None, answer: None })
-    }
-
-    /// The same, to have a policy act on it.
-    pub fn join_to_act(instance: &str) -> Result<Self, ClientError> {
-        let link = ControllerLink::open(LinkSettings::new(instance), needs_to_act)?;
         Ok(Self { link, process: None, answer: None })
     }
 
@@ -116,22 +113,5 @@ impl Client {
         self.link.send(&answer)?;
         self.answer = Some(answer);
         Ok(())
-    }
-}
-
-#[cfg(test)]
-mod tests {
-    use super::*;
-
-    #[test]
-    fn a_robot_is_recorded_whatever_it_shows_and_acted_on_where_the_policy_can_look() {
-        let mut robot = Interface::metaworld();
-        assert!(needs_to_act(&robot).is_empty());
-        robot.camera[0].shape = [128, 128, 3];
-        let found = needs_to_act(&robot);
-        assert!(found.len() == 1 && found[0].to_string().contains("128 x 128 x 3"), "{found:?}");
-        robot.camera.clear();
-        assert!(needs_to_act(&robot)[0].to_string().contains("the robot has none"));
-        assert!(needs(&robot).is_empty());
     }
 }
