@@ -31,9 +31,12 @@ pub struct Client {
     answer: Option<Action>,
 }
 
-/// What the trainer needs of a robot that it acts on: a first camera of the size that it acts on, commands of which zeros are no motion,
-/// and that may change at once. Whatever else it offers is recorded.
-fn needs(robot: &Interface) -> Vec<Mismatch> {
+/// Everything in which a robot is not what is needed.
+pub type Unfit = fn(&Interface) -> Vec<Mismatch>;
+
+/// In what a robot is not one that the trainer can record: commands of which zeros are no motion, and that may change at once. Whatever
+/// else it offers is recorded.
+pub fn unfit_to_record(robot: &Interface) -> Vec<Mismatch> {
     let mut found = Vec::new();
     for action in &robot.action {
         let place = format!("action {}", action.name);
@@ -45,6 +48,12 @@ fn needs(robot: &Interface) -> Vec<Mismatch> {
             found.push(Mismatch::new(&place, "it has a rate_max, which the trainer does not keep"));
         }
     }
+    found
+}
+
+/// In what a robot is not one that the trainer can act on: it looks at the first camera, of its own size.
+pub fn unfit_to_act(robot: &Interface) -> Vec<Mismatch> {
+    let mut found = unfit_to_record(robot);
     let picture = [IMAGE_SIDE, IMAGE_SIDE, 3];
     match robot.camera.first() {
         None => found.push(Mismatch::new("camera", "there is none, and the trainer acts by what it sees")),
@@ -62,14 +71,14 @@ fn needs(robot: &Interface) -> Vec<Mismatch> {
 
 impl Client {
     /// Connects to the simulator that was started.
-    pub fn of(process: SimulatorProcess) -> Result<Self, ClientError> {
-        let link = ControllerLink::open(LinkSettings::new(process.instance()), needs)?;
+    pub fn of(process: SimulatorProcess, unfit: Unfit) -> Result<Self, ClientError> {
+        let link = ControllerLink::open(LinkSettings::new(process.instance()), unfit)?;
         Ok(Self { link, process: Some(process), answer: None })
     }
 
     /// Connects to a simulator that runs, or will.
-    pub fn join(instance: &str) -> Result<Self, ClientError> {
-        let link = ControllerLink::open(LinkSettings::new(instance), needs)?;
+    pub fn join(instance: &str, unfit: Unfit) -> Result<Self, ClientError> {
+        let link = ControllerLink::open(LinkSettings::new(instance), unfit)?;
         Ok(Self { link, process: None, answer: None })
     }
 

@@ -57,7 +57,7 @@ fn with_controller(
     })
 }
 
-fn answer_all(settings: LinkSettings, answer: &dyn Fn(u64, &[f32]) -> Option<Vec<f32>>) {
+fn answer_all(settings: LinkSettings, answer: impl Fn(u64, &[f32]) -> Option<Vec<f32>>) {
     let controller = ControllerLink::open(settings, anything).unwrap();
     while let Ok(Wait::Message(observation)) = controller.wait_observation(SOON) {
         let Some(action) = answer(observation.sequence, observation.view().executed()) else { return };
