@@ -31,7 +31,7 @@ learn: ## A new task (TASK=coffee-pull), or a robot (ROBOT=panda-lift), from dem
 	$(CARGO) build --release --locked -p rcwm-simulator -p rcwm-runtime -p rcwm-lab -p rcwm-trainer
 ifneq ($(ROBOT),)
 	@scripts/setup robosuite
-	@scripts/learn-robot "$(ROBOT)" "$(LEARNT)" "$(if $(filter file,$(origin DEMONSTRATIONS)),220,$(DEMONSTRATIONS))" 50 "$(STATE)"
+	@scripts/learn-robot "$(ROBOT)" "$(LEARNT)" "$(if $(filter file,$(origin DEMONSTRATIONS)),100,$(DEMONSTRATIONS))" 50 "$(STATE)"
 else
 	@scripts/learn "$(TASK)" "$(PRETRAINED)" "$(LEARNT)" "$(DEMONSTRATIONS)" 50 "$(DEMONSTRATOR)" "$(LOOKS)"
 endif
