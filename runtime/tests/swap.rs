@@ -10,7 +10,7 @@ use std::time::Duration;
 use rcwm_models::bundle::PartName;
 use rcwm_models::wire::{ActionSource, ActionValues, ObservationFlags, SimulatorLink};
 use rcwm_runtime::controller::{Controller, ControllerSettings, RunReport, TickLimits};
-use rcwm_runtime::policy::Sampling;
+use rcwm_runtime::policy::{Sampling, SurpriseLimits};
 use rcwm_runtime::swap::{Answer, SwapError, SwapSettings, Swapper, When, ask, name_of_server};
 use rcwm_runtime::{EngineKind, EngineSettings, Policy};
 use rcwm_testkit::{
@@ -36,6 +36,7 @@ fn start_with_limits(link: &OwnLink, engine: EngineSettings, ticks: TickLimits) 
         engine,
         sampling: Sampling::Mode,
         interface: policy.manifest().interface.clone(),
+        surprise: SurpriseLimits::default(),
     };
     let swapper = Swapper::start(settings).unwrap();
     let change = |settings: &mut ControllerSettings| settings.ticks = ticks;
@@ -160,8 +161,8 @@ fn a_bad_bundle_is_refused_with_one_line_and_the_old_one_runs_on() {
     let mut peer_ticks = Peer { link: &peer, sequence: 0 };
     let slow = with_manifest(|manifest| manifest.interface.rate_hz = 20.0);
     let damaged = with_manifest(|manifest| manifest.parts[1].sha256.replace_range(..1, "x"));
-    let sizes = with_manifest(|manifest| manifest.model.deter *= 2);
-    let action = with_manifest(|manifest| manifest.model.action = 7);
+    let sizes = with_manifest(|manifest| manifest.model.as_mut().unwrap().deter *= 2);
+    let action = with_manifest(|manifest| manifest.model.as_mut().unwrap().action = 7);
     let golden = rcwm_testkit::with_golden(|mean| mean + 0.01);
     let missing = tempfile::tempdir().unwrap();
     for (bundle, word) in [

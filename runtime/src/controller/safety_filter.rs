@@ -35,7 +35,10 @@ impl FromStr for Fallback {
         let values: Result<Vec<f32>, _> = text.split(',').map(|value| value.trim().parse()).collect();
         match values.ok().and_then(|values| ActionValues::of(&values)) {
             Some(action) if action.is_finite() => Ok(Self::Given(action)),
-            _ => Err("expected interface, hold, zero, or the finite numbers of an action as in 0,0,0,-1".into()),
+            _ => {
+                Err("expected interface, hold, zero, or the finite numbers of an action as in 0,0,0,-1"
+                    .into())
+            }
         }
     }
 }
@@ -195,7 +198,8 @@ fn measured(observation: &Observation<'_>) -> Option<ActionValues> {
         let range = action.measured.as_deref().and_then(|name| robot.state_range(name));
         range.and_then(|range| state.get(range.start + at).copied()).unwrap_or(f32::NAN)
     };
-    let each = robot.action.iter().flat_map(|action| (0..action.elements.len()).map(move |at| of(action, at)));
+    let each =
+        robot.action.iter().flat_map(|action| (0..action.elements.len()).map(move |at| of(action, at)));
     Some(each.collect())
 }
 
@@ -430,7 +434,10 @@ mod tests {
         let mut first = OwnedObservation::zeroed(&format);
         first.flags = ObservationFlags::FIRST.0;
         first.edit().state().copy_from_slice(&[0.5, -1.5]);
-        assert!(first.view().is_valid(), "zeros, which the second joint cannot be at, say that nothing was executed");
+        assert!(
+            first.view().is_valid(),
+            "zeros, which the second joint cannot be at, say that nothing was executed"
+        );
         filter.observed(&first.view(), true);
         assert_eq!(filter.held().unwrap(), [0.5, -1.5, 0.0]);
         // By no more than rate_max from where it stands.

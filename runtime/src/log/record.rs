@@ -12,7 +12,7 @@ use sha2::{Digest, Sha256};
 use super::pack::{PackedImage, PackedMask};
 use crate::controller::Fallback;
 use crate::engine::EngineSettings;
-use crate::policy::{BranchState, CallKind, Sampling, State, Surprise};
+use crate::policy::{BranchState, CallKind, STAGES, Sampling, State, Surprise};
 
 /// Version of the file.
 pub const VERSION: u32 = 2;
@@ -109,11 +109,12 @@ impl BundleIdentity {
     /// What another bundle differs in, as far as it matters for a tick; none where it is the same.
     #[must_use]
     pub fn difference(&self, other: &Self) -> Option<String> {
-        let names = ["initial", "encoder", "robot", "interaction", "environment", "actor"];
+        let parts = STAGES.iter().map(|part| part.as_str());
         let of = |bundle: &Self, name: &str| {
             bundle.sha256.iter().find(|(part, _)| part == name).map(|(_, sha256)| sha256.clone())
         };
-        let differing = names.into_iter().find(|name| of(self, name) != of(other, name));
+        let differing =
+            std::iter::once("initial").chain(parts).find(|name| of(self, name) != of(other, name));
         let short = |sha256: Option<String>| {
             sha256.map_or("missing".into(), |sha256| sha256.chars().take(12).collect::<String>())
         };
@@ -319,7 +320,7 @@ pub enum LoggedOutcome {
     Failed(String),
 }
 
-/// z and h of both branches, and where the random generator stands.
+/// z and h of every branch, and where the random generator stands. A policy of one branch has the first only.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 pub struct WholeState {
     robot_z: Vec<i64>,
@@ -333,31 +334,28 @@ impl WholeState {
     /// Of the policy's state, and where its random generator stands.
     #[must_use]
     pub fn of(state: &State, noise_position: u128) -> Self {
-        Self {
-            robot_z: state.robot.z.clone(),
-            robot_h: state.robot.h.clone(),
-            environment_z: state.environment.z.clone(),
-            environment_h: state.environment.h.clone(),
-            noise_position,
-        }
+        let mut branches = state.branches.iter().map(|branch| (branch.z.clone(), branch.h.clone()));
+        let mut next = || branches.next().unwrap_or_default();
+        let ((robot_z, robot_h), (environment_z, environment_h)) = (next(), next());
+        Self { robot_z, robot_h, environment_z, environment_h, noise_position }
     }
 
     /// The policy's state, and where its random generator stands.
     #[must_use]
     pub fn restore(&self) -> (State, u128) {
         let branch = |z: &[i64], h: &[f32]| BranchState { z: z.to_vec(), h: h.to_vec() };
-        let state = State {
-            robot: branch(&self.robot_z, &self.robot_h),
-            environment: branch(&self.environment_z, &self.environment_h),
-        };
-        (state, self.noise_position)
+        let mut branches = vec![branch(&self.robot_z, &self.robot_h)];
+        if !self.environment_h.is_empty() {
+            branches.push(branch(&self.environment_z, &self.environment_h));
+        }
+        (State { branches }, self.noise_position)
     }
 }
 
-/// The first half of the sha256 over the bits of z and h of both branches.
+/// The first half of the sha256 over the bits of z and h of every branch.
 pub fn digest(state: &State) -> [u8; DIGEST_BYTES] {
     let mut hash = Sha256::new();
-    for branch in [&state.robot, &state.environment] {
+    for branch in &state.branches {
         branch.z.iter().for_each(|class| hash.update(class.to_le_bytes()));
         branch.h.iter().for_each(|value| hash.update(value.to_le_bytes()));
     }

@@ -8,8 +8,7 @@ use std::time::Duration;
 use anyhow::{Context, Result, ensure};
 use candle_core::Device;
 use indicatif::{ProgressBar, ProgressStyle};
-use rcwm_models::bundle::PartName;
-use rcwm_models::settings::ModelKind;
+use rcwm_models::bundle::BundleKind;
 use rcwm_models::tasks::task_id;
 use rcwm_trainer::checkpoint::Checkpoint;
 use rcwm_trainer::evaluation::{

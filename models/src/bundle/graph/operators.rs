@@ -3,7 +3,7 @@
 use super::attributes::Attributes;
 use super::inferred::{Inferred, take};
 use super::value::Value;
-use super::{DType, Limits, movement};
+use super::{DType, Limits, movement, policies};
 use crate::onnx::data_type;
 
 /// The outputs of an operator; none when it is not on the list. `outputs` is how many the node names.
@@ -29,13 +29,13 @@ pub(super) fn infer(
         "Reshape" => movement::reshape(inputs),
         "Split" => movement::split(attributes, inputs, outputs),
         "Transpose" => movement::transpose(attributes, inputs),
-        _ => return None,
+        _ => return policies::infer(operator, attributes, inputs, outputs),
     })
 }
 
-fn floats<'a, const N: usize>(inputs: &[&'a Value]) -> Result<[&'a Value; N], String> {
+pub(super) fn floats<'a, const N: usize>(inputs: &[&'a Value]) -> Result<[&'a Value; N], String> {
     let inputs = take::<N>(inputs)?;
-    match inputs.iter().find(|input| input.dtype != DType::F32) {
+    match inputs.iter().find(|input| input.dtype != DType::F32 || input.is_absent) {
         None => Ok(inputs),
         Some(other) => Err(format!("an input is {}, expected floats", other.text())),
     }
@@ -71,7 +71,7 @@ fn range_of(operator: &str, a: &Value, b: &Value) -> Option<(i64, i64)> {
     }
 }
 
-fn broadcast(a: &[usize], b: &[usize]) -> Result<Vec<usize>, String> {
+pub(super) fn broadcast(a: &[usize], b: &[usize]) -> Result<Vec<usize>, String> {
     let rank = a.len().max(b.len());
     let dim = |shape: &[usize], i: usize| (i + shape.len()).checked_sub(rank).map_or(1, |i| shape[i]);
     (0..rank)
@@ -91,7 +91,7 @@ fn arg_max(attributes: &mut Attributes<'_>, inputs: &[&Value]) -> Inferred {
     Ok(vec![Value { range, ..Value::new(DType::I64, reduced(&x.shape, &[axis], keep)) }])
 }
 
-fn reduced(shape: &[usize], axes: &[usize], keep: bool) -> Vec<usize> {
+pub(super) fn reduced(shape: &[usize], axes: &[usize], keep: bool) -> Vec<usize> {
     let each = shape.iter().enumerate();
     if keep {
         each.map(|(i, dim)| if axes.contains(&i) { 1 } else { *dim }).collect()
@@ -167,7 +167,7 @@ fn softmax(attributes: &mut Attributes<'_>, inputs: &[&Value]) -> Inferred {
 }
 
 /// Two dimensions, as every convolution here: kernel, strides and pads.
-struct Window {
+pub(super) struct Window {
     kernel: [usize; 2],
     strides: [usize; 2],
     /// Added (or cut) at both ends together.
@@ -175,7 +175,7 @@ struct Window {
 }
 
 impl Window {
-    fn read(attributes: &mut Attributes<'_>, kernel: [usize; 2]) -> Result<Self, String> {
+    pub(super) fn read(attributes: &mut Attributes<'_>, kernel: [usize; 2]) -> Result<Self, String> {
         let as_i64 = kernel.map(|side| side as i64);
         attributes.only("kernel_shape", &as_i64)?;
         attributes.only("dilations", &[1, 1])?;
@@ -192,7 +192,7 @@ impl Window {
     }
 }
 
-fn small<const N: usize>(found: &[i64], min: usize, max: usize) -> Result<[usize; N], String> {
+pub(super) fn small<const N: usize>(found: &[i64], min: usize, max: usize) -> Result<[usize; N], String> {
     let sized: Option<Vec<usize>> = found.iter().map(|x| usize::try_from(*x).ok()).collect();
     let fits = sized.filter(|sized| sized.iter().all(|x| (min..=max).contains(x)));
     fits.and_then(|sized| sized.try_into().ok())
@@ -248,16 +248,18 @@ fn check_unfolded(factors: [usize; 5]) -> Result<(), String> {
     }
 }
 
+/// How often a window fits into a side of so many pixels.
+pub(super) fn picture_side(window: &Window, i: usize, len: usize) -> Result<usize, String> {
+    let covered = len.checked_add(window.pads[i]).and_then(|len| len.checked_sub(window.kernel[i]));
+    let covered = covered.ok_or_else(|| format!("kernel {:?} on a side of {len}", window.kernel))?;
+    Ok(covered / window.strides[i] + 1)
+}
+
 fn conv(attributes: &mut Attributes<'_>, inputs: &[&Value]) -> Inferred {
     let Picture { x: [n, c, height, width], kernel: [to, from, h, w], bias } = picture(inputs)?;
     check_channels(c, from, bias, to)?;
     let window = Window::read(attributes, [h, w])?;
-    let side = |i: usize, len: usize| -> Result<usize, String> {
-        let covered = len.checked_add(window.pads[i]).and_then(|len| len.checked_sub(window.kernel[i]));
-        let covered = covered.ok_or_else(|| format!("kernel {:?} on {height} x {width}", window.kernel))?;
-        Ok(covered / window.strides[i] + 1)
-    };
-    let (height, width) = (side(0, height)?, side(1, width)?);
+    let (height, width) = (picture_side(&window, 0, height)?, picture_side(&window, 1, width)?);
     check_unfolded([c, h, w, height, width])?;
     Ok(vec![Value::new(DType::F32, vec![n, to, height, width])])
 }

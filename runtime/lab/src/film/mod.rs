@@ -17,14 +17,13 @@ mod panels;
 use std::path::{Path, PathBuf};
 
 use rcwm_models::IMAGE_BYTES;
-use rcwm_models::bundle::PartName;
+use rcwm_models::bundle::{BundleKind, PartName};
 use rcwm_models::files::FileError;
 use rcwm_models::lock::{Lock, LockError};
 use rcwm_models::wire::{Observation, ObservationFlags};
 use rcwm_runtime::controller::EpisodeResult;
 use rcwm_runtime::engine::{self, EngineError, Input, Output, Part};
 use rcwm_runtime::log::{Entry, LogError, LogReader, LoggedTick};
-use rcwm_runtime::policy::State;
 use serde::Serialize;
 
 use crate::log::{LoggedEpisode, ReplayError, Replayer};
@@ -160,7 +159,8 @@ impl<'a> Filming<'a> {
         let Some(replayer) = &self.replayer else { return Ok(()) };
         let bundle = replayer.bundle();
         self.rate_hz = bundle.manifest.interface.rate_hz;
-        let part = bundle.part(PartName::Decoder);
+        // What is drawn is what two branches see.
+        let part = bundle.part(PartName::Decoder).filter(|_| bundle.manifest.kind == BundleKind::Rcwm);
         self.decoder =
             part.map(|_| engine::load(bundle, PartName::Decoder, replayer.engine())).transpose()?;
         Ok(())
@@ -217,7 +217,7 @@ impl<'a> Filming<'a> {
 
     fn decode(&mut self) -> Result<(), FilmError> {
         let (Some(decoder), Some(replayer)) = (&mut self.decoder, &self.replayer) else { return Ok(()) };
-        let State { robot, environment } = replayer.policy().state();
+        let [robot, environment] = replayer.policy().state().branches.as_slice() else { return Ok(()) };
         let inputs = [
             Input::I64(&robot.z),
             Input::F32(&robot.h),
