@@ -38,7 +38,7 @@ pub use initial::{InitialBranch, InitialState};
 pub use kind::{BundleKind, PartName};
 pub use load::Bundle;
 pub use manifest::{FORMAT, FileEntry, Limits, Manifest, PartEntry, PolicyInputs, Provenance};
-pub use recurrent::{CARRIED, CARRIED_NEXT, Pixels, PolicyInput, PolicyOutput, PolicySignature};
+pub use recurrent::{CARRIED, CARRIED_NEXT, EXECUTED, Pixels, PolicyInput, PolicyOutput, PolicySignature};
 pub use spec::{DType, TensorSpec};
 pub use write::{NewBundle, WriteError};
 

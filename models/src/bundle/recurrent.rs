@@ -4,13 +4,15 @@
 //! | --- | --- |
 //! | a camera's name, or `image` where there is one camera | u8 `[1, H, W, 3]`; or f32 of 0 to 1, `[1, H, W, 3]` or `[1, 3, H, W]` |
 //! | `state` | f32 `[1, N]`: the states of `policy.inputs`, one after another, in units |
-//! | `action` | f32 `[1, A]`: what was executed, limits at -1 and 1; zeros where an episode begins |
+//! | `executed_action` | f32 `[1, A]`: what was executed, limits at -1 and 1; zeros where an episode begins |
 //! | `state.NAME` | f32, any shape: what `next_state.NAME` gave at the last tick |
 //!
 //! | output | type and shape |
 //! | --- | --- |
 //! | `action` | f32 `[1, A]`, limits at -1 and 1 |
-//! | `next_state.NAME` | as `state.NAME`; a graph may not give one name twice |
+//! | `next_state.NAME` | as `state.NAME` |
+//!
+//! What enters and what leaves have different names because ONNX gives each name once.
 
 use std::ops::Range;
 
@@ -24,6 +26,8 @@ use crate::interface::Camera;
 pub const CARRIED: &str = "state.";
 /// What it begins with where it leaves.
 pub const CARRIED_NEXT: &str = "next_state.";
+/// The input that is the executed action.
+pub const EXECUTED: &str = "executed_action";
 /// Most numbers that are carried from tick to tick.
 const CARRIED_MAX: usize = 1 << 16;
 
@@ -123,8 +127,8 @@ struct Border<'a> {
 }
 
 impl Border<'_> {
-    fn action(&self, name: &str) -> TensorSpec {
-        TensorSpec::new(name, DType::F32, &[1, self.manifest.interface.action_numbers()])
+    fn action(&self) -> TensorSpec {
+        TensorSpec::new("action", DType::F32, &[1, self.manifest.interface.action_numbers()])
     }
 
     fn input(&self, spec: &TensorSpec) -> Result<PolicyInput, BundleError> {
@@ -149,14 +153,14 @@ impl Border<'_> {
                 same("input", spec, &TensorSpec::new("state", DType::F32, &[1, measured]))?;
                 Ok(PolicyInput::State)
             }
-            (None, "action") => same("input", spec, &self.action("action")).map(|()| PolicyInput::Action),
+            (None, EXECUTED) => same("input", spec, &self.action()).map(|()| PolicyInput::Action),
             _ => Err(misfit("input", spec, &format!("one of {}", self.names()))),
         }
     }
 
     fn output(&self, spec: &TensorSpec, inputs: &PolicySignature) -> Result<PolicyOutput, BundleError> {
         if spec.name == "action" {
-            return same("output", spec, &self.action("action")).map(|()| PolicyOutput::Action);
+            return same("output", spec, &self.action()).map(|()| PolicyOutput::Action);
         }
         let mut from = 0;
         for carried in &inputs.carried {
@@ -217,7 +221,7 @@ impl Border<'_> {
             names.push("image");
         }
         names.extend((self.manifest.measured_numbers() > 0).then_some("state"));
-        names.extend(["action", "state.NAME (f32)"]);
+        names.extend([EXECUTED, "state.NAME (f32)"]);
         names.join(", ")
     }
 }

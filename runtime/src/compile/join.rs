@@ -3,7 +3,7 @@
 use std::collections::BTreeSet;
 
 use prost::Message;
-use rcwm_models::bundle::{Bundle, CARRIED, PartName};
+use rcwm_models::bundle::{Bundle, CARRIED, EXECUTED, PartName};
 use rcwm_models::onnx::{self, Model};
 use tract_onnx::prelude::{Framework, TractResult};
 use tract_onnx::tract_hir::internal::{Factoid, InferenceModelExt};
@@ -37,7 +37,7 @@ pub(super) fn join(bundle: &Bundle) -> Result<Graph, CompileError> {
     // A policy in one graph gives what its own entry says.
     if let Some(policy) = bundle.manifest.part(PartName::Policy) {
         graph.outputs.extend(policy.outputs.iter().map(|output| format!("{}/{}", policy.name, output.name)));
-        let known_before = |name: &str| name == inputs::ACTION || name.starts_with(CARRIED);
+        let known_before = |name: &str| name == EXECUTED || name.starts_with(CARRIED);
         let names = policy.inputs.iter().map(|input| input.name.clone());
         late.extend(names.filter(|name| !known_before(name)));
     }

@@ -58,7 +58,7 @@ pub(super) fn record(bundle: &Bundle, ticks: usize) -> Result<(Tensors, String),
         for ((output, spec), found) in
             signature.outputs.iter().zip(&manifest.parts[0].outputs).zip(graph.outputs())
         {
-            rows.push(format!("expect/policy/{}", spec.name), &spec.shape[1..], found);
+            rows.push(format!("expect/policy/{}", spec.name), &spec.shape, found);
             if let PolicyOutput::Carried(range) = output {
                 carried[range.clone()].copy_from_slice(found);
             }

@@ -18,7 +18,7 @@ use crate::bundle::{Request, build, list};
   rcwm-lab bundle --onnx lstm.onnx --interface models/src/interface/arm.toml --out bundles/lstm \\
       --rename obs=state --rename actions=action --carry h_in=h_out --carry c_in=c_out
 
-The graph's inputs are cameras by their names (or `image`), `state`, `action` (executed last) and carried
+The graph's inputs are cameras by their names (or `image`), `state`, `executed_action` and carried
 `state.NAME`; its outputs `action` (-1 to 1, from limit to limit) and `next_state.NAME`. Shapes and how pictures
 enter: docs/own-policy.md. Missing frames: the last action is held for --imagined-ticks-max ticks, then the fallback.")]
 pub(super) struct BundleArguments {
