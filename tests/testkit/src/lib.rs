@@ -40,6 +40,12 @@ pub fn smallest_bundle() -> PathBuf {
     smallest.expect("at least one bundle is shipped in models/bundles")
 }
 
+/// A bundle of kind `dreamer` for the same robot: `rcwm-trainer init --model vanilla --preset debug --set deter=16 --set hidden=16
+/// --set cnn_depth=2 --set units=16 --seed 5`, then `export --parts required --golden-ticks 4`.
+pub fn dreamer_bundle() -> PathBuf {
+    Path::new(env!("CARGO_MANIFEST_DIR")).join("../data/dreamer")
+}
+
 /// A copy of the smallest bundle with a changed manifest.
 pub fn with_manifest(change: impl FnOnce(&mut Manifest)) -> tempfile::TempDir {
     let copy = tempfile::tempdir().unwrap();

@@ -50,7 +50,7 @@ the episodes need masks. Beside it stands the error on the pixels outside the ro
 what other actions from the same start change in the imagined pictures. Windows end before the task
 is solved and the robot moves in them (--windows anywhere takes all). Checkpoints that differ in
 their training seed only are taken together: then intervals are over seeds. With --task: the policy is exported and deployed by rcwm-runtime in
-rcwm-simulator, in lock-step; a vanilla model, which no runtime deploys, decides in this process.
+rcwm-simulator, in lock-step; with --engine trainer it decides in this process.
 With --report: both, as one page that shows all that lies in the folder's parts; a part is measured
 again only if it is asked for from something else. Ctrl-C keeps what is done.")]
 #[command(group = clap::ArgGroup::new("recorded").multiple(true).args(["data", "report"]))]
