@@ -82,6 +82,9 @@ fn what_is_carried_starts_anew_with_an_episode_and_follows_what_was_executed() {
         let mut policy = Policy::new(&bundle, engine, Sampling::Mode).unwrap();
         let (picture, executed) = (image(0), ActionValues::from([0.4; 4]));
         let first = policy.observe(seen(&picture), None).unwrap();
+        let carried = policy.state().clone();
+        policy.warm_caches();
+        assert_eq!(*policy.state(), carried);
         assert_eq!((first.surprise, first.std), (None, ActionValues::zeros(4)));
         assert!(first.action.iter().all(|x| (-1.0..=1.0).contains(x)));
         let second = policy.observe(seen(&picture), Some(&executed)).unwrap();

@@ -115,6 +115,8 @@ impl Camera {
 pub(super) struct Recurrent {
     graph: Graph,
     action: ActionValues,
+    /// Black pictures, and zeros measured and carried: what the caches are warmed with.
+    nothing: (Vec<u8>, Vec<f32>, Vec<f32>),
 }
 
 impl Recurrent {
@@ -124,8 +126,12 @@ impl Recurrent {
             let instead = "its graph runs as it is; leave it out".to_owned();
             return Err(EngineError::Choice { what, instead }.into());
         }
-        let action = ActionValues::zeros(bundle.manifest.interface.action_numbers());
-        Ok(Self { graph: Graph::load(bundle, settings)?, action })
+        let manifest = &bundle.manifest;
+        let action = ActionValues::zeros(manifest.interface.action_numbers());
+        let graph = Graph::load(bundle, settings)?;
+        let carried = vec![0.0; graph.signature.carried_numbers()];
+        let nothing = (vec![0; manifest.image_bytes()], vec![0.0; manifest.measured_numbers()], carried);
+        Ok(Self { graph, action, nothing })
     }
 }
 
@@ -137,7 +143,7 @@ impl Tick for Recurrent {
     }
 
     fn observe(&mut self, inputs: Inputs<'_>, work: &mut Work<'_>) -> Result<(), PolicyError> {
-        let Self { graph, action } = self;
+        let Self { graph, action, .. } = self;
         let Work { state, buffers, clock, .. } = work;
         graph.run(inputs, action, &state.branches[0].h)?;
         for (output, found) in graph.signature.outputs.iter().zip(&graph.outputs) {
@@ -156,5 +162,11 @@ impl Tick for Recurrent {
     /// Never asked: [`super::Policy::imagine`] holds the last action where there is no world model.
     fn imagine(&mut self, _: &mut Work<'_>) -> Result<(), PolicyError> {
         Err(PolicyError::Observation("a policy without a world model imagines nothing".into()))
+    }
+
+    fn warm_caches(&mut self) {
+        let Self { graph, action, nothing: (image, state, carried) } = self;
+        // What comes out, an error included, is read by nobody.
+        let _ = graph.run(Inputs { image, state }, action, carried);
     }
 }

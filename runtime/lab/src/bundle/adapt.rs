@@ -1,6 +1,7 @@
 //! Another library's graph in our names: inputs and outputs renamed, a batch of 1, nothing else changed.
 
 use rcwm_models::bundle::{CARRIED, CARRIED_NEXT, DType, PartEntry, TensorSpec};
+use rcwm_models::interface::Interface;
 use rcwm_models::onnx::{Graph, ValueInfo};
 
 use super::{BundlingError, Request};
@@ -83,4 +84,13 @@ pub(super) fn policy_inputs(request: &Request, part: &PartEntry) -> Vec<String> 
     let cameras = robot.camera.iter().filter(|camera| only || reads(&camera.name));
     let states = robot.state.iter().filter(|_| reads("state"));
     cameras.map(|camera| camera.name.clone()).chain(states.map(|state| state.name.clone())).collect()
+}
+
+/// The robot's cameras, and its states with their sizes.
+pub(super) fn offers(robot: &Interface) -> String {
+    let cameras = robot.camera.iter().map(|camera| format!("camera {} {:?}", camera.name, camera.shape));
+    let states = robot.state.iter().map(|state| format!("{} of {}", state.name, state.elements.len()));
+    let states = states.collect::<Vec<_>>().join(", ");
+    let states = (!states.is_empty()).then(|| format!("state ({states})"));
+    cameras.chain(states).collect::<Vec<_>>().join(", ")
 }

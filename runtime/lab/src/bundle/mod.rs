@@ -9,8 +9,8 @@ use std::path::{Path, PathBuf};
 use ndarray::{ArrayD, IxDyn};
 use prost::Message;
 use rcwm_models::bundle::{
-    Bundle, BundleKind, DType, FORMAT, FileEntry, Manifest, NewBundle, PART_BYTES_MAX, PartEntry, PartName,
-    PolicyInputs, PolicySignature, Provenance, TensorSpec, WriteError,
+    Bundle, BundleError, BundleKind, DType, FORMAT, FileEntry, Manifest, NewBundle, PART_BYTES_MAX,
+    PartEntry, PartName, PolicyInputs, PolicySignature, Provenance, TensorSpec, WriteError,
 };
 use rcwm_models::files::{FileError, read_capped, sha256_hex};
 use rcwm_models::interface::Interface;
@@ -42,6 +42,11 @@ pub enum BundlingError {
         "{role} {name:?} has a size that is not fixed, or no type; export with a batch of 1 and fixed sizes, without dynamic axes"
     )]
     NotFixed { role: &'static str, name: String },
+    /// Inputs or outputs are not what the robot gives and takes.
+    #[error(
+        "{path}: {source}; the robot offers {offers}; --rename FROM=TO gives other names, --carry IN=OUT carries an output on"
+    )]
+    DoesNotFit { path: PathBuf, source: BundleError, offers: String },
     /// Initial states or golden values are unusable.
     #[error("{path}: {source}")]
     Tensors { path: PathBuf, source: TensorsError },
@@ -120,8 +125,13 @@ pub fn build(request: &Request, place: &Path) -> Result<Bundle, BundlingError> {
         parts: vec![part],
     };
     // Names and sizes are told before anything else.
-    manifest.check().map_err(WriteError::from)?;
-    let signature = PolicySignature::of(&manifest, &manifest.parts[0]).map_err(WriteError::from)?;
+    let does_not_fit = |source| BundlingError::DoesNotFit {
+        path: request.onnx.clone(),
+        source,
+        offers: adapt::offers(&request.interface),
+    };
+    manifest.check().map_err(does_not_fit)?;
+    let signature = PolicySignature::of(&manifest, &manifest.parts[0]).map_err(does_not_fit)?;
     manifest.initial = new.file("initial.safetensors", &to_bytes(&initial(request, &signature)?)?)?;
     let bundle = new.check(&manifest)?;
     let (golden, words) = match &request.golden {

@@ -25,6 +25,7 @@ struct Arguments {
 const EXAMPLES: &str = "\
 Examples:
   rcwm-lab inspect --bundle models/bundles/hammer
+  rcwm-lab bundle --onnx policy.onnx --interface models/src/interface/arm.toml --out bundles/policy
   rcwm-lab bench --bundle models/bundles/hammer --engine all --ticks 2000
   rcwm-lab replay --log runs/demo.rcwmlog --bundle models/bundles/hammer
   rcwm-lab film --log runs/demo.rcwmlog --bundle models/bundles/hammer --out runs/demo

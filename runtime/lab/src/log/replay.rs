@@ -310,7 +310,7 @@ impl Replayer {
         self.executed(tick);
         let of_policy = [ActionSource::Policy as u32, ActionSource::Imagined as u32];
         // What a policy without a world model holds where nothing came is its decision, too.
-        let held = record.observed.is_none() && self.decided.is_some();
+        let held = tick.observation.is_none() && self.decided.is_some();
         let action = if of_policy.contains(&record.answer.source) || held {
             self.decided
         } else {
