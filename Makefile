@@ -11,7 +11,9 @@ PRETRAINED ?= models/small
 DEMONSTRATIONS ?= 50
 DEMONSTRATOR ?= pushed
 LOOKS ?= plain
-LEARNT ?= runs/learn/$(TASK)
+LEARNT ?= runs/learn/$(if $(ROBOT),$(ROBOT)-$(STATE),$(TASK))
+ROBOT ?=
+STATE ?= joints
 BIN = $${CARGO_TARGET_DIR:-target}/release
 
 .PHONY: help demo learn test lint clean
@@ -24,10 +26,15 @@ demo: ## A trained policy (TASK=hammer) over shared memory: summary and films in
 	$(CARGO) build --release --locked -p rcwm-simulator -p rcwm-runtime -p rcwm-lab
 	@scripts/demo "$(BUNDLE)" "$(TASK)" "$(EPISODES)" "$(OUT)" "$(SEED)"
 
-learn: ## A new task (TASK=coffee-pull) from 50 demonstrations, deployed and scored: policy, film and figures in runs/learn/TASK
+learn: ## A new task (TASK=coffee-pull), or a robot (ROBOT=panda-lift), from demonstrations, deployed and scored: all in runs/learn
 	@scripts/setup demo
 	$(CARGO) build --release --locked -p rcwm-simulator -p rcwm-runtime -p rcwm-lab -p rcwm-trainer
+ifneq ($(ROBOT),)
+	@scripts/setup robosuite
+	@scripts/learn-robot "$(ROBOT)" "$(LEARNT)" "$(if $(filter file,$(origin DEMONSTRATIONS)),220,$(DEMONSTRATIONS))" 50 "$(STATE)"
+else
 	@scripts/learn "$(TASK)" "$(PRETRAINED)" "$(LEARNT)" "$(DEMONSTRATIONS)" 50 "$(DEMONSTRATOR)" "$(LOOKS)"
+endif
 
 test: ## Everything that can be tested on one machine
 	@scripts/setup test

@@ -95,7 +95,7 @@ fn an_output_that_is_not_finite_never_reaches_the_wire() {
 
 #[test]
 fn an_observation_that_is_not_finite_is_refused_and_the_last_action_held() {
-    for (fallback, held) in [(Fallback::Hold, true), (Fallback::Zero, false)] {
+    for (fallback, held) in [(Fallback::Hold, true), (Fallback::Zero, false), (Fallback::Interface, false)] {
         let link = own_link();
         let peer = link.peer();
         let controller = start_controller(&smallest_bundle(), &link, fallback);

@@ -6,7 +6,7 @@ use std::sync::atomic::AtomicBool;
 use std::time::{Duration, Instant};
 
 use rcwm_models::bundle::{ActionMode, Bundle};
-use rcwm_models::wire::{ActionSource, ActionValues, OwnedObservation, SimulatorLink, Wait};
+use rcwm_models::wire::{ActionSource, ActionValues, ControllerLink, OwnedObservation, SimulatorLink, Wait};
 use rcwm_runtime::controller::{
     Controller, ControllerError, ControllerSettings, Ended, Fallback, Tick, TickLimits, TickObserver,
 };
@@ -96,7 +96,10 @@ fn a_controller_that_ends_before_its_loop_begins_tells_the_robot_too() {
     let link = own_link();
     let peer = link.peer();
     let policy = Policy::load(&smallest_bundle(), EngineSettings::tract()).unwrap();
-    drop(Controller::open(policy, ControllerSettings::new(link.0.clone())).unwrap());
+    let own = ControllerLink::open(link.0.clone(), |_| Vec::new()).unwrap();
+    peer.poll_events().unwrap();
+    assert!(own.wait_robot(Duration::from_secs(5)).unwrap().is_some());
+    drop(Controller::on(Box::new(own), policy, ControllerSettings::new(link.0.clone())).unwrap());
     assert!(hears_closed(&peer));
 }
 
@@ -183,7 +186,9 @@ fn an_executed_action_out_of_range_is_refused_like_one_that_is_not_finite() {
     for bad in [3e38, -1.5, f32::INFINITY, f32::NAN] {
         let link = own_link();
         let peer = link.peer();
-        let controller = start_controller_with(&smallest_bundle(), &link, |_| {});
+        let controller = start_controller_with(&smallest_bundle(), &link, |settings| {
+            settings.fallback = Fallback::Hold;
+        });
         let good = ask(&peer, &observation(0, 0));
         let answer = ask(&peer, &executed(1, [0.1, bad, 0.1, 0.1]));
         assert_eq!((answer.source, answer.action), (ActionSource::Fallback as u32, good.action), "{bad}");
@@ -218,6 +223,7 @@ fn what_was_executed_is_held_where_the_policy_has_nothing_fit_to_send() {
         let peer = link.peer_of(bundle.path());
         let controller = start_controller_with(bundle.path(), &link, |settings| {
             settings.surprise.robot_max = Some(0.0);
+            settings.fallback = Fallback::Hold;
         });
         ask(&peer, &observation(0, 0));
         for (sequence, action) in [(1, [0.7, -0.6, 0.5, 0.4]), (2, [0.2, 0.2, -0.2, 1.0])] {
@@ -272,6 +278,12 @@ fn zeros_as_a_fallback_are_refused_for_positions_with_a_line_that_says_what_to_d
     let settings = ControllerSettings { fallback: Fallback::Zero, ..ControllerSettings::new(link.0.clone()) };
     let error = Controller::open(policy, settings).err().unwrap();
     assert!(matches!(error, ControllerError::ZeroIsAPose) && error.to_string().contains("hold"), "{error}");
+    // Nor is a pose that the robot may not take, which its limits would make another one of.
+    let policy = Policy::load(bundle.path(), EngineSettings::tract()).unwrap();
+    let fallback = Fallback::Given([0.0, 1.5, 0.0, 0.0].into());
+    let settings = ControllerSettings { fallback, ..ControllerSettings::new(link.0.clone()) };
+    let error = Controller::open(policy, settings).err().unwrap().to_string();
+    assert!(error.contains("number 2 is 1.5") && error.contains("-1 to 1"), "{error}");
 }
 
 #[test]

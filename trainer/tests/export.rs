@@ -211,7 +211,7 @@ fn a_vanilla_model_becomes_a_bundle_of_one_branch() {
     let vanilla = support::untrained(ModelKind::Vanilla, 1);
     // The parts of two branches are another kind's.
     let error = export(&vanilla, &place, &options()).unwrap_err().to_string();
-    assert!(error.contains("part dynamics is missing"), "{error}");
+    assert!(error.contains("part robot is not one of kind dreamer"), "{error}");
     assert_eq!(entries(folder.path()), 0);
     let options = Options { parts: BundleKind::Dreamer.all_parts().collect(), ..options() };
     let bundle = export(&vanilla, &place, &options).unwrap();

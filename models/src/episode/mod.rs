@@ -8,7 +8,7 @@
 //! | `reward` | f32 | [T] | of that transition |
 //! | `is_first`, `is_last`, `is_terminal`, `success` | bool | [T] | |
 //! | `robot_mask` (optional) | u8 | [T, S, S, 1] | 1 where the robot is, else 0 |
-//! | `proprio` (optional) | f32 | [T, p] | the robot's measured state: joint positions, velocities and the like |
+//! | `proprio` (optional) | f32 | [T, p] | the robot's measured state: joint positions, velocities and the like; left out where p is 0 |
 //! | `disturbed` (optional) | u8 | [T, S, S, 3] | the same moments in another look |
 //!
 //! `robot_mask` and `disturbed` have a `_2` to `_4` of their own, for every further camera or for none. In memory the cameras are side by
@@ -18,22 +18,25 @@
 //! more or less (`[T, 1]` for `[T]`), masks as 0 and 255 or as numbers of objects. An action that stands at the image it was
 //! chosen on, as danijar/dreamerv3 stores it, is refused.
 
+mod builder;
 mod npy;
 mod npz;
 
 use std::path::{Path, PathBuf};
-use std::sync::Arc;
 
 use ndarray::{Array1, Array2, Array3, Array4, Axis, Slice};
 
 use crate::files::{FileError, read_capped, write_atomic, write_new};
 use crate::settings::ModelSettings;
-use crate::wire::{Format, Observation, ObservationFlags};
+
+pub use builder::EpisodeBuilder;
 
 /// Longest episode accepted, in steps.
 pub const STEPS_MAX: usize = 100_000;
-/// Largest episode file accepted, in bytes.
+/// Largest episode file accepted, in bytes; also most bytes of all its images.
 pub const EPISODE_BYTES_MAX: u64 = 1 << 30;
+/// Most bytes that an episode is recorded to: the file is still accepted where nothing in it can be packed.
+pub const RECORDED_BYTES_MAX: usize = 1_000_000_000;
 
 /// One episode, or the part of one that was seen.
 #[derive(Debug, Clone, PartialEq)]
@@ -93,6 +96,24 @@ pub enum EpisodeError {
     /// An observation that does not continue the episode.
     #[error("recording: {0}")]
     Order(String),
+    /// A robot whose observations make no episode that could be read again.
+    #[error("recording: the robot has {found}, an episode holds {expected}")]
+    Robot {
+        found: String,
+        /// What it must be.
+        expected: String,
+    },
+    /// The episode is as long as one may be.
+    #[error(
+        "recording: episode {episode} is full after {steps} steps of {step_bytes} bytes, at most {STEPS_MAX} steps and \
+         {RECORDED_BYTES_MAX} bytes are kept; end episodes sooner, or record fewer or smaller cameras"
+    )]
+    Full {
+        /// Its number on the wire.
+        episode: u64,
+        steps: usize,
+        step_bytes: usize,
+    },
 }
 
 /// What an episode has in another size than a model needs it.
@@ -221,12 +242,12 @@ impl Episode {
         Ok(write_new(path, &self.to_bytes(path)?)?)
     }
 
-    /// The file that [`Episode::write`] writes; `path` is for messages.
+    /// The file that [`Episode::write`] writes; `path` is for messages. What [`Episode::read`] would refuse is refused here.
     ///
     /// # Errors
-    /// [`EpisodeError::Archive`].
+    /// [`EpisodeError::Archive`], [`EpisodeError::Array`], or [`FileError::TooLarge`].
     pub fn to_bytes(&self, path: &Path) -> Result<Vec<u8>, EpisodeError> {
-        npz::to_bytes(self).map_err(|reason| EpisodeError::Archive { path: path.to_path_buf(), reason })
+        npz::to_bytes(self, path)
     }
 
     /// Whether a `.npz` file has disturbed pictures; the pictures themselves are not read.
@@ -249,140 +270,6 @@ pub fn robot_above(largest: f64) -> f64 {
         x if x <= 255.0 => 127.0,
         x if x <= 32767.0 => 0.0,
         _ => 32767.0,
-    }
-}
-
-/// The side of all cameras of a robot, in pixels, and how many there are.
-fn cameras_of(format: &Format) -> (usize, usize) {
-    let cameras = &format.interface().camera;
-    (cameras.first().map_or(0, |camera| camera.shape[0]), cameras.len())
-}
-
-/// Collects observations into an [`Episode`].
-#[derive(Debug, Default)]
-pub struct EpisodeBuilder {
-    /// Of the first observation, and so of all.
-    format: Option<Arc<Format>>,
-    image: Vec<u8>,
-    action: Vec<f32>,
-    reward: Vec<f32>,
-    flags: Vec<ObservationFlags>,
-    robot_mask: Vec<bool>,
-    masks: usize,
-    proprio: Vec<f32>,
-}
-
-impl EpisodeBuilder {
-    /// An empty episode.
-    #[must_use]
-    pub fn new() -> Self {
-        Self::default()
-    }
-
-    /// Steps so far.
-    #[must_use]
-    pub fn len(&self) -> usize {
-        self.flags.len()
-    }
-
-    /// Whether nothing was pushed yet.
-    #[must_use]
-    pub fn is_empty(&self) -> bool {
-        self.flags.is_empty()
-    }
-
-    /// Adds an observation. The first one pushed counts as the episode's first.
-    ///
-    /// # Errors
-    /// [`EpisodeError::Order`] when the episode was already over, begins again in its middle, grows beyond
-    /// [`STEPS_MAX`], or the observation is not [valid](Observation::is_valid).
-    pub fn push(&mut self, observation: &Observation<'_>) -> Result<(), EpisodeError> {
-        let flags = ObservationFlags(observation.flags);
-        let refuse = |reason: &str| {
-            let (episode, step) = (observation.episode, observation.step);
-            Err(EpisodeError::Order(format!("episode {episode}, step {step}: {reason}")))
-        };
-        if self.flags.last().is_some_and(|last| last.contains(ObservationFlags::LAST)) {
-            return refuse("the episode was already over");
-        }
-        if !self.is_empty() && flags.contains(ObservationFlags::FIRST) {
-            return refuse("a new episode began before the last one was finished");
-        }
-        if self.len() == STEPS_MAX {
-            return refuse("the episode is too long");
-        }
-        let sizes = &observation.format().interface().camera;
-        let fits = sizes.first().is_some_and(|first| {
-            let [rows, columns, _] = first.shape;
-            rows == columns && sizes.iter().all(|camera| camera.shape == first.shape)
-        });
-        if !fits {
-            return refuse("its cameras are not square and of one size; crop them on the robot's side");
-        }
-        if !observation.is_finite() {
-            return refuse("a number is not finite");
-        }
-        if !observation.has_executable_action() {
-            return refuse("the executed action is out of its limits");
-        }
-        let format = self.format.get_or_insert_with(|| Arc::clone(observation.format()));
-        if format != observation.format() {
-            return refuse("it is of another interface than those before it");
-        }
-        let (side, cameras) = cameras_of(format);
-        // The cameras side by side, pixel by pixel.
-        for pixel in 0..side * side {
-            for camera in 0..cameras {
-                self.image.extend_from_slice(&observation.image(camera)[3 * pixel..3 * pixel + 3]);
-            }
-        }
-        let from = self.action.len();
-        self.action.resize(from + format.action_numbers(), 0.0);
-        // Finite: see above.
-        let _ = format.normaliser().from_units(observation.executed(), &mut self.action[from..]);
-        self.reward.push(observation.reward);
-        self.flags.push(flags);
-        let masks: Option<Vec<&[u8]>> = (0..cameras).map(|camera| observation.mask(camera)).collect();
-        if let Some(masks) = masks {
-            for pixel in 0..side * side {
-                self.robot_mask.extend(masks.iter().map(|mask| mask[pixel] > 127));
-            }
-            self.masks += 1;
-        }
-        self.proprio.extend_from_slice(observation.state());
-        Ok(())
-    }
-
-    /// The episode, with masks only if every step had one; `None` if nothing was pushed. The builder is empty afterwards.
-    #[must_use]
-    pub fn finish(&mut self) -> Option<Episode> {
-        let this = std::mem::take(self);
-        let steps = this.len();
-        let format = this.format?;
-        let bits = |flag| this.flags.iter().map(|flags| flags.contains(flag)).collect::<Array1<bool>>();
-        let mut is_first = bits(ObservationFlags::FIRST);
-        is_first[0] = true;
-        let fits = "pushed in whole steps";
-        let (side, cameras) = cameras_of(&format);
-        let vectors =
-            |numbers: Vec<f32>| Array2::from_shape_vec((steps, numbers.len() / steps), numbers).expect(fits);
-        let mut action = vectors(this.action);
-        // No action led to the first step of what was seen, also where it was joined in its middle.
-        action.row_mut(0).fill(0.0);
-        Some(Episode {
-            is_last: bits(ObservationFlags::LAST),
-            is_terminal: bits(ObservationFlags::TERMINAL),
-            success: bits(ObservationFlags::SUCCESS),
-            pushed: bits(ObservationFlags::PUSHED),
-            is_first,
-            image: Array4::from_shape_vec((steps, side, side, 3 * cameras), this.image).expect(fits),
-            action,
-            reward: this.reward.into(),
-            robot_mask: (this.masks == steps)
-                .then(|| Array3::from_shape_vec((steps, side, side * cameras), this.robot_mask).expect(fits)),
-            proprio: Some(vectors(this.proprio)),
-            disturbed: None,
-        })
     }
 }
 

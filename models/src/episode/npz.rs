@@ -1,17 +1,19 @@
 //! The archive behind an episode file. Shapes are checked before numbers are unpacked, so that a header cannot ask for more memory
 //! than an episode may take.
 
-use std::io::{BufReader, Cursor, Read, Write};
+mod write;
+
+use std::io::{BufReader, Cursor, Read};
 use std::path::Path;
 
 use ndarray::{Array1, Array3, Array4, ArrayD, Axis, Dimension, Ix1, Ix2, Ix3, Ix4, concatenate, stack};
-use ndarray_npy::WriteNpyExt;
-use zip::write::SimpleFileOptions;
-use zip::{CompressionMethod, ZipArchive, ZipWriter};
+use zip::ZipArchive;
 
 use super::npy::{Array, Header};
 use super::{EPISODE_BYTES_MAX, Episode, EpisodeError, STEPS_MAX, robot_above};
 use crate::files::open_capped;
+pub(super) use write::to_bytes;
+
 use crate::settings::{ACTION_NUMBERS_MAX, CAMERAS_MAX, IMAGE_SIDES, STATE_NUMBERS_MAX};
 
 /// An array of each camera.
@@ -21,8 +23,8 @@ const MASK: Cameras = ["robot_mask", "robot_mask_2", "robot_mask_3", "robot_mask
 const DISTURBED_ALL: Cameras = ["disturbed", "disturbed_2", "disturbed_3", "disturbed_4"];
 /// Key of the pictures in another look.
 pub(super) const DISTURBED: &str = DISTURBED_ALL[0];
-/// Most bytes of all images of an episode: those of the most steps of one small camera.
-const IMAGE_BYTES_MAX: usize = STEPS_MAX * 64 * 64 * 3;
+
+const PROPRIO: &str = "proprio";
 
 /// Sizes that an archive has chosen.
 #[derive(Debug, Clone, Copy)]
@@ -47,6 +49,17 @@ struct Reader<'a> {
     archive: ZipArchive<Cursor<&'a [u8]>>,
     /// `T`, once the images have told it.
     steps: Option<usize>,
+}
+
+impl<'a> Reader<'a> {
+    fn open(path: &'a Path, bytes: &'a [u8]) -> Result<Self, EpisodeError> {
+        let broken = |error| EpisodeError::Archive {
+            path: path.to_path_buf(),
+            reason: format!("no whole archive of arrays ({error}); remove it or record it again"),
+        };
+        let archive = ZipArchive::new(Cursor::new(bytes)).map_err(broken)?;
+        Ok(Self { path, archive, steps: None })
+    }
 }
 
 impl Reader<'_> {
@@ -113,6 +126,8 @@ impl Reader<'_> {
         match *rest.as_slice() {
             [] => Ok(Some(1)),
             [width] if (1..=most).contains(&width) => Ok(Some(width)),
+            // A robot that measures nothing, as others may write it.
+            [0] if key == PROPRIO => Ok(Some(0)),
             _ => {
                 let expected = format!("numbers of shape [T, n], n from 1 to {most}");
                 Err(self.wrong(key, format!("of shape {shape:?}"), expected))
@@ -122,15 +137,25 @@ impl Reader<'_> {
 
     /// The sizes that the headers tell.
     fn sizes(&mut self) -> Result<Sizes, EpisodeError> {
-        let shape = self.stored_shape("image").unwrap_or_default();
-        let side = shape.iter().skip(1).copied().find(|side| IMAGE_SIDES.contains(side));
+        let side = match self.stored_shape("image") {
+            Some(shape) => {
+                let side = shape.iter().skip(1).copied().find(|side| IMAGE_SIDES.contains(side));
+                side.ok_or_else(|| {
+                    let [small, large] = IMAGE_SIDES;
+                    let expected = format!("numbers of shape [T, S, S, 3], S {small} or {large}");
+                    self.wrong("image", format!("of shape {shape:?}"), expected)
+                })?
+            }
+            // What is missing, or damaged, is told with what is expected of all arrays.
+            None => IMAGE_SIDES[0],
+        };
         let further =
             IMAGE[1..].iter().take_while(|key| self.archive.index_for_name(&format!("{key}.npy")).is_some());
         Ok(Sizes {
-            side: side.unwrap_or(IMAGE_SIDES[0]),
+            side,
             cameras: 1 + further.count(),
             action: self.width("action", ACTION_NUMBERS_MAX)?.unwrap_or(1),
-            state: self.width("proprio", STATE_NUMBERS_MAX)?,
+            state: self.width(PROPRIO, STATE_NUMBERS_MAX)?,
         })
     }
 
@@ -141,8 +166,8 @@ impl Reader<'_> {
         let shape = self.shape("image", &image)?.ok_or_else(|| self.missing("image"))?;
         self.steps = shape.first().copied();
         let bytes = shape.iter().product::<usize>() * sizes.cameras;
-        if bytes > IMAGE_BYTES_MAX {
-            let expected = format!("at most {IMAGE_BYTES_MAX} bytes of all cameras; cut the episode");
+        if bytes as u64 > EPISODE_BYTES_MAX {
+            let expected = format!("at most {EPISODE_BYTES_MAX} bytes of all cameras; cut the episode");
             return Err(self.wrong("image", format!("of {bytes} bytes"), expected));
         }
         for (key, axes) in [("action", &[sizes.action][..]), ("reward", &[]), ("is_first", &[])] {
@@ -156,7 +181,9 @@ impl Reader<'_> {
             self.shape(MASK[camera], &image[..2])?;
             self.shape(DISTURBED_ALL[camera], &image)?;
         }
-        self.shape("proprio", &[sizes.state.unwrap_or(1)])?;
+        if sizes.state != Some(0) {
+            self.shape(PROPRIO, &[sizes.state.unwrap_or(1)])?;
+        }
         Ok(sizes)
     }
 
@@ -183,10 +210,19 @@ impl Reader<'_> {
     ) -> Result<Option<ndarray::Array<f32, D>>, EpisodeError> {
         let Some(array) = self.array(key, axes)? else { return Ok(None) };
         let array = array.map(|number| number as f32);
-        if array.iter().any(|x| !x.is_finite()) {
-            return Err(self.wrong(key, "not finite everywhere".into(), "finite numbers".into()));
-        }
+        self.check_finite(key, array.iter())?;
         Ok(Some(dimensions(array)))
+    }
+
+    fn check_finite<'a>(
+        &self,
+        key: &'static str,
+        mut numbers: impl Iterator<Item = &'a f32>,
+    ) -> Result<(), EpisodeError> {
+        if numbers.all(|x| x.is_finite()) {
+            return Ok(());
+        }
+        Err(self.wrong(key, "not finite everywhere".into(), "finite numbers".into()))
     }
 
     /// Truth values of any type: what is more than a half.
@@ -253,12 +289,7 @@ fn dimensions<T, D: Dimension>(array: ArrayD<T>) -> ndarray::Array<T, D> {
 
 /// Parses an episode's archive; `path` is for messages.
 pub(super) fn read(path: &Path, bytes: &[u8]) -> Result<Episode, EpisodeError> {
-    let broken = |error| EpisodeError::Archive {
-        path: path.to_path_buf(),
-        reason: format!("no whole archive of arrays ({error}); remove it or record it again"),
-    };
-    let archive = ZipArchive::new(Cursor::new(bytes)).map_err(broken)?;
-    let mut reader = Reader { path, archive, steps: None };
+    let mut reader = Reader::open(path, bytes)?;
     let sizes = reader.check_shapes()?;
     let image = read_images(&mut reader, &IMAGE, sizes)?.ok_or_else(|| reader.missing("image"))?;
     let steps = image.shape()[0];
@@ -276,7 +307,10 @@ pub(super) fn read(path: &Path, bytes: &[u8]) -> Result<Episode, EpisodeError> {
         success: reader.flags("success")?.unwrap_or_else(none),
         pushed: reader.flags("pushed")?.unwrap_or_else(none),
         robot_mask: read_masks(&mut reader, sizes)?,
-        proprio: reader.floats::<Ix2>("proprio", &[sizes.state.unwrap_or(1)])?,
+        proprio: match sizes.state {
+            Some(0) | None => None,
+            Some(numbers) => reader.floats::<Ix2>(PROPRIO, &[numbers])?,
+        },
         disturbed: read_images(&mut reader, &DISTURBED_ALL, sizes)?,
     };
     reader.check_actions(&episode)?;
@@ -321,66 +355,6 @@ fn read_masks(
             all.into_shape_with_order(shape).expect(ALIKE)
         }
     }))
-}
-
-/// Packs an episode into a compressed archive.
-pub(super) fn to_bytes(episode: &Episode) -> Result<Vec<u8>, String> {
-    let mut zip = ZipWriter::new(Cursor::new(Vec::new()));
-    add_images(&mut zip, &IMAGE, &episode.image)?;
-    add(&mut zip, "action", &episode.action)?;
-    add(&mut zip, "reward", &episode.reward)?;
-    for (key, flags) in [
-        ("is_first", &episode.is_first),
-        ("is_last", &episode.is_last),
-        ("is_terminal", &episode.is_terminal),
-        ("success", &episode.success),
-    ] {
-        add(&mut zip, key, flags)?;
-    }
-    if episode.pushed.iter().any(|pushed| *pushed) {
-        add(&mut zip, "pushed", &episode.pushed)?;
-    }
-    if let Some(mask) = &episode.robot_mask {
-        let cameras = episode.image.len_of(Axis(3)) / 3;
-        for (camera, key) in MASK.iter().enumerate().take(cameras) {
-            let pixels = mask.slice(ndarray::s![.., .., camera..;cameras]);
-            add(&mut zip, key, &pixels.mapv(u8::from).insert_axis(Axis(3)))?;
-        }
-    }
-    if let Some(proprio) = &episode.proprio {
-        add(&mut zip, "proprio", proprio)?;
-    }
-    if let Some(disturbed) = &episode.disturbed {
-        add_images(&mut zip, &DISTURBED_ALL, disturbed)?;
-    }
-    Ok(zip.finish().map_err(|error| error.to_string())?.into_inner())
-}
-
-/// The images [T, S, S, 3 C], an array a camera.
-fn add_images(
-    zip: &mut ZipWriter<Cursor<Vec<u8>>>,
-    keys: &Cameras,
-    images: &Array4<u8>,
-) -> Result<(), String> {
-    let cameras = images.axis_chunks_iter(Axis(3), 3);
-    keys.iter().zip(cameras).try_for_each(|(key, images)| add(zip, key, &images))
-}
-
-fn add<S, D>(
-    zip: &mut ZipWriter<Cursor<Vec<u8>>>,
-    key: &str,
-    array: &ndarray::ArrayBase<S, D>,
-) -> Result<(), String>
-where
-    S: ndarray::Data,
-    S::Elem: ndarray_npy::WritableElement,
-    D: Dimension,
-{
-    let mut bytes = Vec::new();
-    array.write_npy(&mut bytes).map_err(|error| error.to_string())?;
-    let options = SimpleFileOptions::default().compression_method(CompressionMethod::Deflated);
-    zip.start_file(format!("{key}.npy"), options).map_err(|error| error.to_string())?;
-    zip.write_all(&bytes).map_err(|error| error.to_string())
 }
 
 #[cfg(test)]

@@ -1,5 +1,6 @@
 use super::*;
-use crate::wire::{Format, OwnedObservation};
+use crate::interface::Interface;
+use crate::wire::{Format, ObservationFlags, OwnedObservation};
 
 fn observation(step: u32, last: bool, mask: bool) -> OwnedObservation {
     let mut whole = OwnedObservation::zeroed(&Format::metaworld());
@@ -128,4 +129,99 @@ fn what_does_not_fit_a_model_is_named_with_what_was_found_and_what_is_needed() {
     let other = ModelSettings { state: 14, ..fits.clone() };
     assert_eq!(said(&large(), other), "proprio: of 3 numbers, of 14 numbers");
     assert_eq!(said(&Episode { proprio: None, ..large() }, fits), "proprio: missing, of 3 numbers");
+}
+
+/// A robot like Meta-World's arm with other cameras, all of this size.
+fn robot(cameras: usize, [rows, columns]: [usize; 2]) -> Interface {
+    let mut robot = Interface::metaworld();
+    let mut camera = robot.camera.remove(0);
+    for number in 0..cameras {
+        (camera.name, camera.shape) = (format!("camera{number}"), [rows, columns, 3]);
+        robot.camera.push(camera.clone());
+    }
+    robot
+}
+
+fn pushed(robot: Interface) -> Result<Option<Episode>, EpisodeError> {
+    let mut builder = EpisodeBuilder::new();
+    builder.push(&OwnedObservation::zeroed(&Format::of(robot)).view())?;
+    Ok(builder.finish())
+}
+
+#[test]
+fn what_is_recorded_of_any_robot_is_read_back_or_refused_at_its_first_observation() {
+    let folder = tempfile::tempdir().unwrap();
+    let path = folder.path().join("episode.npz");
+    let without_state = Interface { state: Vec::new(), ..robot(1, [64, 64]) };
+    let mut many_numbers = robot(1, [64, 64]);
+    many_numbers.action[0].elements = (0..64).map(|at| at.to_string()).collect();
+    (many_numbers.action[0].low, many_numbers.action[0].high) = (vec![-2.0; 64], vec![2.0; 64]);
+    for robot in [robot(1, [64, 64]), robot(4, [128, 128]), without_state, many_numbers] {
+        let episode = pushed(robot).unwrap().unwrap();
+        episode.write(&path).unwrap();
+        assert_eq!(Episode::read(&path).unwrap(), episode);
+    }
+    let mut two_sizes = robot(2, [64, 64]);
+    two_sizes.camera[1].shape = [128, 128, 3];
+    let mut large_state = robot(1, [64, 64]);
+    let state = crate::interface::State {
+        elements: (0..600).map(|at| at.to_string()).collect(),
+        ..large_state.state[0].clone()
+    };
+    large_state.state =
+        ["a", "b"].map(|name| crate::interface::State { name: name.into(), ..state.clone() }).into();
+    for (robot, found) in [
+        (robot(0, [0, 0]), "no camera"),
+        (robot(1, [480, 640]), "a camera of 480 x 640 x 3"),
+        (robot(1, [32, 32]), "a camera of 32 x 32 x 3"),
+        (robot(5, [64, 64]), "5 cameras of 64 x 64 x 3, "),
+        (two_sizes, "2 cameras of 64 x 64 x 3, 128 x 128 x 3"),
+        (large_state, "a state of 1200 numbers"),
+    ] {
+        let said = match pushed(robot) {
+            Err(error @ EpisodeError::Robot { .. }) => error.to_string(),
+            other => panic!("{found}: {other:?}"),
+        };
+        assert!(said.contains(found) && said.contains("an episode holds") && !said.contains('\n'), "{said}");
+    }
+}
+
+#[test]
+fn an_episode_that_could_not_be_read_back_is_not_written() {
+    let folder = tempfile::tempdir().unwrap();
+    let path = folder.path().join("episode.npz");
+    let blank = || Episode::blank(2);
+    for (episode, key, found) in [
+        (Episode::blank_of(2, 32, 1, 4), "image", "[2, 32, 32, 3]"),
+        (Episode::blank_of(2, 64, 5, 4), "image", "of 15 channels"),
+        (Episode::blank_of(2, 64, 0, 4), "image", "missing"),
+        (Episode::blank_of(0, 64, 1, 4), "image", "[0, 64, 64, 3]"),
+        (Episode::blank_of(2, 64, 1, 65), "action", "[2, 65]"),
+        (Episode { action: Array2::from_elem((2, 4), 0.5), ..blank() }, "action", "not zero at step 0"),
+        (Episode { reward: Array1::from_elem(2, f32::NAN), ..blank() }, "reward", "not finite"),
+        (Episode { reward: Array1::zeros(3), ..blank() }, "reward", "[3]"),
+        (Episode { proprio: Some(Array2::zeros((2, 1025))), ..blank() }, "proprio", "[2, 1025]"),
+        (Episode { robot_mask: Some(Array3::from_elem((2, 64, 32), true)), ..blank() }, "robot_mask", "32"),
+        (Episode { disturbed: Some(Array4::zeros((2, 64, 64, 6))), ..blank() }, "disturbed", "6]"),
+    ] {
+        let said = episode.write(&path).unwrap_err().to_string();
+        assert!(said.contains(&format!("{key:?}")) && said.contains(found) && !path.exists(), "{said}");
+    }
+    Episode { proprio: Some(Array2::zeros((2, 0))), ..blank() }.write(&path).unwrap();
+    assert_eq!(Episode::read(&path).unwrap().proprio, None);
+}
+
+#[test]
+fn an_episode_that_nobody_ends_does_not_take_all_memory() {
+    let step_bytes = Format::metaworld().layout().observation_bytes;
+    let mut builder = EpisodeBuilder::of_at_most(3 * step_bytes + 1);
+    for step in 0..3 {
+        builder.push(&observation(step, false, true).view()).unwrap();
+    }
+    let error = builder.push(&observation(3, false, true).view()).unwrap_err();
+    assert!(matches!(error, EpisodeError::Full { steps: 3, .. }), "{error}");
+    assert!(error.to_string().contains("full after 3 steps"), "{error}");
+    assert_eq!(builder.finish().unwrap().len(), 3, "what was pushed is kept");
+    // Packed or not, what is recorded is a file that is read.
+    const { assert!((RECORDED_BYTES_MAX as u64) < EPISODE_BYTES_MAX / 100 * 99) };
 }

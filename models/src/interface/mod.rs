@@ -37,6 +37,7 @@ mod checks;
 mod compare;
 mod layout;
 mod normalise;
+mod numbers;
 #[cfg(test)]
 mod tests;
 
@@ -50,6 +51,7 @@ pub use checks::{ACTION_NUMBERS_MAX, CAMERAS_MAX};
 pub use compare::{Mismatch, mismatches};
 pub use layout::{Block, Layout};
 pub use normalise::{Normaliser, NotFinite};
+pub use numbers::{ActionNumber, Safe};
 
 /// Everything that goes over the wire between a robot and its controller.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]

@@ -22,10 +22,9 @@ pub struct Format {
 impl Format {
     #[must_use]
     pub fn of(interface: Interface) -> Arc<Self> {
-        let limits = |of: fn(&crate::interface::Action) -> &Vec<f64>| {
-            interface.action.iter().flat_map(of).map(|x| *x as f32).collect()
-        };
-        let (low, high) = (limits(|action| &action.low), limits(|action| &action.high));
+        let numbers = interface.numbers();
+        let low = numbers.iter().map(|number| number.low).collect();
+        let high = numbers.iter().map(|number| number.high).collect();
         let (layout, normaliser) = (Layout::of(&interface), Normaliser::of(&interface));
         Arc::new(Self { layout, hash: interface.hash(), low, high, normaliser, interface })
     }

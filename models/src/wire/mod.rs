@@ -24,9 +24,10 @@
 mod action;
 pub mod clock;
 mod format;
-mod link;
+pub(in crate::wire) mod link;
 mod messages;
 mod observation;
+pub mod robot;
 
 pub use action::{ACTION_NUMBERS_MAX, Action, ActionSource, ActionValues};
 pub use format::Format;

@@ -97,8 +97,9 @@ class Interface:
         self.cameras: list[dict] = table.get("camera", [])
         self.actions: list[dict] = table["action"]
         #: Smallest and largest value of each number of an action, in units.
-        self.low = [float(x) for action in self.actions for x in action["low"]]
-        self.high = [float(x) for action in self.actions for x in action["high"]]
+        #: As the messages have them: an action at its limit is within it.
+        self.low = [ctypes.c_float(x).value for action in self.actions for x in action["low"]]
+        self.high = [ctypes.c_float(x).value for action in self.actions for x in action["high"]]
         self.state_numbers = sum(len(state["elements"]) for state in self.states)
 
     def canonical(self) -> str:

@@ -2,8 +2,11 @@
 
 #![allow(clippy::unwrap_used, reason = "a test that fails panics")]
 
+mod crafted;
+
 use std::path::{Path, PathBuf};
 
+use crafted::{header, payloads, write};
 use rand::seq::IndexedRandom;
 use rand::{Rng, SeedableRng};
 use rand_chacha::ChaCha8Rng;
@@ -11,43 +14,28 @@ use rcwm_lab::film::film;
 use rcwm_lab::log::{LoggedLatencies, ReplayError, ReplayReport, Replayer, write_episodes};
 use rcwm_lab::plot::{Curve, plot};
 use rcwm_models::bundle::Bundle;
-use rcwm_models::wire::{ActionSource, Format, ObservationFlags, OwnedObservation};
+use rcwm_models::interface::Interface;
+use rcwm_models::wire::{ActionValues, Format, ObservationFlags, OwnedObservation};
 
 use rcwm_runtime::EngineSettings;
 use rcwm_runtime::controller::Fallback;
-use rcwm_runtime::log::frames::{FrameReader, MAGIC, Next, write_frame, write_start};
-use rcwm_runtime::log::pack::{ImagePacker, PackedMask};
+use rcwm_runtime::log::frames::{FrameReader, MAGIC, Next, PAYLOAD_BYTES_MAX, write_frame, write_start};
+use rcwm_runtime::log::pack::ImagePacker;
 use rcwm_runtime::log::{
-    Answer, BundleIdentity, DIGEST_BYTES, Header, LogError, LogReader, LoggedCall, LoggedOutcome, Machine,
-    Observed, Record, TickRecord, WholeState,
+    BundleIdentity, Header, LogError, LogReader, LoggedCall, LoggedOutcome, Record, TickRecord, WholeState,
 };
-use rcwm_runtime::policy::{BranchState, CallKind, Policy, STAGES, Sampling, State};
+use rcwm_runtime::policy::{BranchState, CallKind, Policy, STAGES, State};
 use rcwm_runtime::telemetry::Stage;
 
 fn bundle() -> PathBuf {
     Path::new(env!("CARGO_MANIFEST_DIR")).join("../../models/bundles/untrained")
 }
 
-fn header(bundle: &Bundle) -> Header {
-    Header {
-        program: "test".into(),
-        started_unix_s: 0,
-        instance: "test".into(),
-        bundle: BundleIdentity::of(&bundle.manifest),
-        engine: EngineSettings::tract(),
-        sampling: Sampling::Sample { seed: 1 },
-        fallback: Fallback::Hold,
-        rate_max: Some(0.1),
-        stages: Vec::new(),
-        machine: Machine::here(),
-    }
-}
-
 fn state_of(policy: &Policy) -> (State, u128) {
     (policy.state().clone(), 0)
 }
 
-fn tick(images: &mut ImagePacker, step: u32, state: Option<WholeState>) -> TickRecord {
+fn tick(images: &mut [ImagePacker], step: u32, state: Option<WholeState>) -> TickRecord {
     let mut observation = OwnedObservation::zeroed(&Format::metaworld());
     (observation.step, observation.sequence) = (step, u64::from(step));
     observation.flags = ObservationFlags::default()
@@ -55,52 +43,19 @@ fn tick(images: &mut ImagePacker, step: u32, state: Option<WholeState>) -> TickR
         .with(ObservationFlags::MASK_VALID, true)
         .0;
     observation.edit().image(0)[step as usize] = 200;
-    let observation = observation.view();
-    let image = images.pack(observation.image(0), step == 0);
-    let mask = observation.mask(0).map(PackedMask::pack);
     let action = (step > 0).then_some([0.1; 4].into());
     let (outcome, stage_ns) = ([0.1; 4].into(), vec![1; STAGES.len()]);
     let decided = LoggedOutcome::Decided { action: outcome, recomputed: false, surprise: None, stage_ns };
-    TickRecord {
-        dropped_before: 0,
-        resumes: state.is_some(),
-        is_first: step == 0,
-        observed: Some(Observed::of(&observation, vec![image], vec![mask])),
-        scheduled_ns: 10,
-        received_ns: 20,
-        overtaken: false,
-        calls: vec![
-            LoggedCall { kind: CallKind::Observe, action, outcome: decided },
-            LoggedCall {
-                kind: CallKind::WorkAhead,
-                action: Some([0.1; 4].into()),
-                outcome: LoggedOutcome::Done(5),
-            },
-        ],
-        answer: Answer {
-            answers: u64::from(step),
-            published_ns: 30,
-            source: ActionSource::Policy as u32,
-            action: [0.1; 4].into(),
+    let calls = vec![
+        LoggedCall { kind: CallKind::Observe, action, outcome: decided },
+        LoggedCall {
+            kind: CallKind::WorkAhead,
+            action: Some([0.1; 4].into()),
+            outcome: LoggedOutcome::Done(5),
         },
-        digest: [0; DIGEST_BYTES],
-        state,
-    }
-}
-
-fn payloads(header: &Header, records: &[Record]) -> Vec<Vec<u8>> {
-    let header = serde_json::to_vec(header).unwrap();
-    let records = records.iter().map(|record| postcard::to_allocvec(record).unwrap());
-    std::iter::once(header).chain(records).collect()
-}
-
-fn write(path: &Path, payloads: &[Vec<u8>]) {
-    let mut bytes = Vec::new();
-    write_start(&mut bytes).unwrap();
-    for payload in payloads {
-        write_frame(&mut bytes, payload).unwrap();
-    }
-    std::fs::write(path, bytes).unwrap();
+    ];
+    let resumes = state.is_some();
+    TickRecord { resumes, calls, state, ..crafted::tick(images, &observation, [0.1; 4].into()) }
 }
 
 /// Everything that the tools do with a log; the replay's report where it came so far.
@@ -128,13 +83,20 @@ fn interface() -> Record {
 }
 
 fn of_records(change: impl FnOnce(&mut Header, &mut Vec<TickRecord>)) -> Result<ReplayReport, ReplayError> {
+    of_records_after(vec![interface()], change)
+}
+
+/// The same with other records before the ticks.
+fn of_records_after(
+    mut records: Vec<Record>,
+    change: impl FnOnce(&mut Header, &mut Vec<TickRecord>),
+) -> Result<ReplayReport, ReplayError> {
     let bundle = Bundle::open(&bundle()).unwrap();
-    let mut header = header(&bundle);
-    let mut images = ImagePacker::default();
+    let mut header = header(BundleIdentity::of(&bundle.manifest));
+    let mut images = [ImagePacker::default()];
     let mut ticks = (0..4).map(|step| tick(&mut images, step, None)).collect();
     change(&mut header, &mut ticks);
-    let records = ticks.into_iter().map(|tick| Record::Tick(Box::new(tick)));
-    let records: Vec<_> = std::iter::once(interface()).chain(records).collect();
+    records.extend(ticks.into_iter().map(|tick| Record::Tick(Box::new(tick))));
     let folder = tempfile::tempdir().unwrap();
     let path = folder.path().join("crafted.rcwmlog");
     write(&path, &payloads(&header, &records));
@@ -205,6 +167,81 @@ fn actions_that_are_no_numbers_do_not_reach_the_safety_filter() {
     }
 }
 
+/// What is said of a log that is read up to a damage after `ticks` ticks.
+fn damage_after(ticks: u64, report: Result<ReplayReport, ReplayError>) -> String {
+    let report = report.unwrap();
+    assert_eq!(report.ticks, ticks, "{:?}", report.log_damage);
+    report.log_damage.unwrap()
+}
+
+#[test]
+fn actions_of_another_count_of_numbers_than_the_bundle_s_are_named_and_end_the_log() {
+    for count in [0, 3, 5, 64] {
+        let other = || ActionValues::zeros(count);
+        let changes: [&dyn Fn(&mut TickRecord); 3] =
+            [&|tick| tick.answer.action = other(), &|tick| tick.calls[1].action = Some(other()), &|tick| {
+                match &mut tick.calls[0].outcome {
+                    LoggedOutcome::Decided { action, .. } => *action = other(),
+                    _ => unreachable!(),
+                }
+            }];
+        for change in changes {
+            let said = damage_after(2, of_records(|_, ticks| change(&mut ticks[2])));
+            assert!(said.contains(&format!("{count} numbers, expected 4")), "{said}");
+            assert!(said.contains("log the run again"), "{said}");
+        }
+    }
+    // Nothing was sent, and there was nothing to send.
+    let report = of_records(|_, ticks| {
+        (ticks[2].overtaken, ticks[2].answer.action) = (true, ActionValues::zeros(0));
+    });
+    assert_eq!(report.unwrap().log_damage, None);
+}
+
+#[test]
+fn a_header_with_other_counts_of_numbers_than_the_bundle_s_actions_is_said() {
+    let refused = |change: &dyn Fn(&mut Header)| {
+        let error = of_records(|header, _| change(header)).unwrap_err();
+        let ReplayError::Log(LogError::NotALog { reason, .. }) = error else { panic!("{error}") };
+        reason
+    };
+    for count in [0, 3, 5] {
+        let said = refused(&|header| header.fallback = Fallback::Given(ActionValues::zeros(count)));
+        assert!(said.contains(&format!("fallback of {count} numbers, expected 4")), "{said}");
+    }
+    for (low, high) in [(4, 3), (0, 0), (65, 65)] {
+        let said = refused(&|header| {
+            let limits = &mut header.bundle.action_limits;
+            (limits.low, limits.high) = (vec![-1.0; low], vec![1.0; high]);
+        });
+        assert!(said.contains(&format!("{low} lowest and {high} highest")), "{said}");
+    }
+    let said = refused(&|header| header.instance = "../../etc/passwd".into());
+    assert!(said.contains("instance"), "{said}");
+}
+
+#[test]
+fn an_interface_or_a_policy_of_another_count_of_action_numbers_ends_the_log() {
+    let mut other = Interface::metaworld();
+    let action = &mut other.action[0];
+    action.elements.push("more".into());
+    action.low.push(-1.0);
+    action.high.push(1.0);
+    let said = damage_after(0, of_records_after(vec![Record::Interface(other.canonical())], |_, _| ()));
+    assert!(said.contains("5 numbers, expected 4"), "{said}");
+    let mut identity = BundleIdentity::of(&Bundle::open(&bundle()).unwrap().manifest);
+    identity.action_limits.low.pop();
+    identity.action_limits.high.pop();
+    let said = damage_after(0, of_records_after(vec![interface(), Record::Policy(identity)], |_, _| ()));
+    assert!(said.contains("3 numbers, expected 4"), "{said}");
+}
+
+#[test]
+fn interfaces_in_a_row_however_many_do_not_overflow_the_stack() {
+    let report = of_records_after((0..20_000).map(|_| interface()).collect(), |_, _| ()).unwrap();
+    assert_eq!((report.ticks, report.log_damage), (4, None));
+}
+
 #[test]
 fn a_header_that_no_run_has_written_is_said() {
     for threads in [0, usize::MAX] {
@@ -235,7 +272,7 @@ fn a_pipe_is_no_log_and_is_not_waited_for() {
 #[test]
 fn bytes_changed_at_random_behind_checksums_that_fit_make_no_tool_panic() {
     let bundle = Bundle::open(&bundle()).unwrap();
-    let mut images = ImagePacker::default();
+    let mut images = [ImagePacker::default()];
     let loaded = Policy::load(&self::bundle(), EngineSettings::tract()).unwrap();
     let whole = |step| (step % 2 == 0).then(|| WholeState::of(loaded.state(), 7));
     let mut records: Vec<_> = std::iter::once(interface())
@@ -243,7 +280,7 @@ fn bytes_changed_at_random_behind_checksums_that_fit_make_no_tool_panic() {
         .collect();
     records.insert(2, Record::Policy(BundleIdentity::of(&bundle.manifest)));
     records.push(Record::End { ticks: 4, dropped: 0 });
-    let sound = payloads(&header(&bundle), &records);
+    let sound = payloads(&header(BundleIdentity::of(&bundle.manifest)), &records);
     let folder = tempfile::tempdir().unwrap();
     let path = folder.path().join("crafted.rcwmlog");
     write(&path, &sound);
@@ -274,4 +311,15 @@ fn what_was_written_is_read_back_frame_by_frame() {
     let mut frames = FrameReader::new(&bytes[MAGIC.len() + 4..], 0);
     assert!(matches!(frames.read().unwrap(), Next::Payload(b"abc")));
     assert!(matches!(frames.read().unwrap(), Next::End));
+}
+
+#[test]
+fn a_frame_that_could_not_be_read_back_is_not_written() {
+    let mut bytes = Vec::new();
+    let largest = vec![0; PAYLOAD_BYTES_MAX];
+    write_frame(&mut bytes, &largest).unwrap();
+    assert!(matches!(FrameReader::new(&bytes[..], 0).read().unwrap(), Next::Payload(_)));
+    bytes.clear();
+    let said = write_frame(&mut bytes, &[largest, vec![0]].concat()).unwrap_err().to_string();
+    assert!(bytes.is_empty() && said.contains(&format!("at most {PAYLOAD_BYTES_MAX}")), "{said}");
 }

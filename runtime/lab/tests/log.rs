@@ -93,7 +93,7 @@ fn imagined_rate_limited_fallback_and_late_ticks_are_replayed() {
     let bundle = Bundle::open(&smallest_bundle()).unwrap();
     let sampling = Sampling::Sample { seed: 6 };
     let policy = Policy::new(&bundle, EngineSettings::tract(), sampling).unwrap();
-    let (fallback, rate_max) = (Fallback::Given([0.5, -0.5, 0.0, 3.0].into()), Some(0.03));
+    let (fallback, rate_max) = (Fallback::Given([0.5, -0.5, 0.0, 1.0].into()), Some(0.03));
     let settings =
         LogSettings { fallback, rate_max, ..LogSettings::new("test", EngineSettings::tract(), sampling) };
     let file = folder.path().join("run.rcwmlog");

@@ -36,6 +36,17 @@ def test_the_file_has_the_keys_and_shapes_of_the_trainer(tmp_path, make_episode)
     assert found["interface"] == (1,)
 
 
+def test_a_robot_that_measures_nothing_has_no_proprio(tmp_path, make_episode, small):
+    text = small.canonical().replace('fallback = "hold-measured"\nmeasured = "joint_pos"', 'fallback = "hold"')
+    states, rest = text.index("[[interface.state]]"), text.index("[[interface.camera]]")
+    robot = interface.parse(text[:states] + text[rest:])
+    episode = replace(make_episode(5), interface=robot, proprio=np.zeros((5, 0), np.float32))
+    episode.write(tmp_path / "a.npz")
+    assert "proprio" not in np.load(tmp_path / "a.npz")
+    assert_same(episode, read(tmp_path / "a.npz"))
+    assert read(tmp_path / "a.npz", robot).proprio.shape == (5, 0)
+
+
 def test_an_episode_of_another_robot_is_refused(tmp_path, make_episode, small):
     make_episode(5).write(tmp_path / "a.npz")
     other = interface.parse(small.canonical().replace("rate_hz = 20.0", "rate_hz = 30.0"))

@@ -33,7 +33,7 @@ pub enum ControllerError {
     /// Zeros are no rest for the policy.
     #[error(
         "--fallback zero would send the robot to the pose of zeros, for the bundle's actions are absolute positions; use \
-         --fallback interface, or name a pose as numbers"
+         --fallback hold or interface, or name a pose as numbers"
     )]
     ZeroIsAPose,
     /// A number to fall back to is one that the robot may not be commanded.

@@ -46,7 +46,7 @@ pub use transport::Transport;
 use std::sync::atomic::{AtomicBool, Ordering};
 use std::time::Duration;
 
-use rcwm_models::wire::{Action, ControllerLink, ObservationSample, Wait};
+use rcwm_models::wire::{Action, ControllerLink, LinkError, ObservationSample, Wait};
 
 use crate::pacing::{Pacing, Plan};
 use crate::policy::{InputReader, Policy};
@@ -265,7 +265,7 @@ impl Controller {
             Plan::GetReady => Ok(Wait::TimedOut),
             Plan::Overdue => {
                 self.looked = true;
-                Ok(self.link.poll()?.map_or(Wait::TimedOut, Wait::Message))
+                self.link.poll().map(|sample| sample.map_or(Wait::TimedOut, Wait::Message))
             }
             Plan::Wait { spin, timeout } => {
                 self.looked = false;
@@ -280,10 +280,27 @@ impl Controller {
             Ok(Wait::TimedOut) if self.looked => Ok(Brought::Overdue),
             Ok(Wait::TimedOut) => Ok(Brought::Nothing),
             Ok(Wait::Closed) => Ok(Brought::Closed),
+            // No observation of this robot's, whatever it is: nothing is known but that it came.
+            Err(LinkError::MessageLength { .. }) => {
+                self.counters.refused_observations += 1;
+                Ok(Brought::Nothing)
+            }
             // A signal interrupts waiting; it has set `stop`.
             Err(_) if stop.load(Ordering::Relaxed) => Ok(Brought::Nothing),
             Err(error) => Err(error.into()),
         }
+    }
+
+    /// Looks whether a newer observation has come.
+    fn take_newer(&mut self) -> Result<(), ControllerError> {
+        self.newer = match self.link.poll() {
+            Err(LinkError::MessageLength { .. }) => {
+                self.counters.refused_observations += 1;
+                None
+            }
+            polled => polled?,
+        };
+        Ok(())
     }
 
     /// Prepares the policy for an observation that will come soon.
@@ -300,6 +317,8 @@ impl Controller {
         self.state = step(self.state, Event::Left, self.settings.ticks).0;
         self.pacing.rest();
         self.cut_episode();
+        // The next one may offer something else; it is looked at anew.
+        self.link.forget_robot();
     }
 
     /// Ends the run when nobody has been there for too long.

@@ -2,10 +2,11 @@
 
 use std::str::FromStr;
 
+use rcwm_models::interface::Safe;
 use rcwm_models::wire::{ActionValues, Observation, ObservationFlags};
 use serde::{Deserialize, Serialize};
 
-use crate::policy::{ActionLimits, Safe};
+use crate::policy::ActionLimits;
 
 /// What is sent when the policy has nothing fit to send.
 #[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]

@@ -25,7 +25,7 @@ impl Controller {
         if period_ns == 0 || self.link.now_ns() <= due_ns.saturating_add(period_ns) {
             return Ok(false);
         }
-        self.newer = self.link.poll()?;
+        self.take_newer()?;
         Ok(self.newer.as_ref().is_some_and(|newer| self.arrival(newer, self.link.now_ns()).is_new()))
     }
 

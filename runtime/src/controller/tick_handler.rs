@@ -239,7 +239,7 @@ impl Controller {
             }
         };
         // What has come by now is worth more than an answer without it, if it will be answered itself.
-        self.newer = self.link.poll()?;
+        self.take_newer()?;
         let overtaken = self.newer.as_ref().is_some_and(|newer| self.will_answer(newer));
         let answer = self.send_unless(overtaken, missing.sequence, source, action)?;
         let times = TickTimes {

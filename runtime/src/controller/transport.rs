@@ -38,6 +38,9 @@ pub trait Transport {
     /// See [`ControllerLink::clean_up_dead_peers`].
     fn clean_up_dead_peers(&self);
 
+    /// See [`ControllerLink::forget_robot`].
+    fn forget_robot(&mut self) {}
+
     /// See [`ControllerLink::say_closed`].
     ///
     /// # Errors
@@ -68,6 +71,10 @@ impl Transport for ControllerLink {
 
     fn clean_up_dead_peers(&self) {
         Self::clean_up_dead_peers(self);
+    }
+
+    fn forget_robot(&mut self) {
+        Self::forget_robot(self);
     }
 
     fn say_closed(&self) -> Result<(), LinkError> {

@@ -6,8 +6,8 @@ use super::record::VERSION;
 
 /// The first bytes of a log.
 pub const MAGIC: [u8; 8] = *b"rcwm-log";
-/// Largest payload accepted, in bytes: far more than a tick of large cameras takes.
-const PAYLOAD_BYTES_MAX: usize = 64 << 20;
+/// Largest payload of a frame, in bytes: far more than a tick of large cameras takes.
+pub const PAYLOAD_BYTES_MAX: usize = 64 << 20;
 
 /// What comes next in a file.
 pub enum Next<'a> {
@@ -25,9 +25,14 @@ pub fn write_start(to: &mut impl Write) -> io::Result<()> {
     to.write_all(&VERSION.to_le_bytes())
 }
 
-/// Gives the frame's bytes.
+/// Gives the frame's bytes. A payload that could not be read back is refused, and nothing of it is written.
 pub fn write_frame(to: &mut impl Write, payload: &[u8]) -> io::Result<u64> {
-    let len = u32::try_from(payload.len()).map_err(io::Error::other)?;
+    let found = payload.len();
+    let len = u32::try_from(found).ok().filter(|_| found <= PAYLOAD_BYTES_MAX).ok_or_else(|| {
+        io::Error::other(format!(
+            "a tick of {found} bytes, at most {PAYLOAD_BYTES_MAX} can be read back; log fewer or smaller cameras"
+        ))
+    })?;
     to.write_all(&len.to_le_bytes())?;
     to.write_all(&crc32c::crc32c(payload).to_le_bytes())?;
     to.write_all(payload)?;

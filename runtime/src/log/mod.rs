@@ -14,15 +14,17 @@
 //! after dropped ticks holds the whole state and the place of the random generator.
 
 pub mod frames;
+mod header;
 pub mod pack;
 mod reader;
 mod record;
 mod writer;
 
+pub use header::{BundleIdentity, Header, Machine};
 pub use reader::{Entry, LogReader, LoggedTick};
 pub use record::{
-    Answer, BundleIdentity, DIGEST_BYTES, Header, KEYFRAME_TICKS, LoggedCall, LoggedOutcome, Machine,
-    Observed, Record, TickRecord, WholeState, digest,
+    Answer, DIGEST_BYTES, KEYFRAME_TICKS, LoggedCall, LoggedOutcome, Observed, Record, TickRecord,
+    WholeState, digest,
 };
 pub use writer::{LogSettings, LogSummary, LogWriter};
 
@@ -55,7 +57,10 @@ pub enum LogError {
         expected: u32,
     },
     /// It was cut or changed.
-    #[error("log {path} is damaged at byte {offset}: {reason}; the {ticks} ticks before it are sound")]
+    #[error(
+        "log {path} is damaged at byte {offset}: {reason}; the {ticks} ticks before it are sound, for those after it \
+         log the run again"
+    )]
     Damaged {
         path: PathBuf,
         /// Where the broken frame begins.

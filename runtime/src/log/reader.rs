@@ -2,6 +2,7 @@
 
 use std::fs::{File, OpenOptions};
 use std::io::{BufReader, Read};
+use std::ops::ControlFlow;
 use std::os::unix::fs::OpenOptionsExt;
 use std::path::{Path, PathBuf};
 
@@ -12,8 +13,9 @@ use rcwm_models::wire::{Format, OwnedObservation};
 
 use super::LogError;
 use super::frames::{FrameReader, MAGIC, Next, read_up_to};
+use super::header::{BundleIdentity, Header, check_count};
 use super::pack::ImagePacker;
-use super::record::{BundleIdentity, Header, Record, TickRecord, VERSION};
+use super::record::{Record, TickRecord, VERSION};
 
 /// What a log holds, one after another.
 #[derive(Debug)]
@@ -117,42 +119,63 @@ impl LogReader {
         if self.over {
             return Ok(None);
         }
-        let offset = self.frames.offset;
-        let read = self.read_entry(offset);
+        let read = self.read_entry();
         self.over = !matches!(read, Ok(Some(_)));
         read
     }
 
-    fn read_entry(&mut self, offset: u64) -> Result<Option<Entry>, LogError> {
-        let (path, ticks) = (self.path.clone(), self.ticks);
-        let damaged = |reason: String| LogError::Damaged { path: path.clone(), offset, reason, ticks };
-        let next = self.frames.read().map_err(|source| LogError::Io { path: path.clone(), source })?;
-        let payload = match next {
-            Next::Payload(payload) => payload,
-            Next::End => return Ok(None),
-            Next::Damaged(reason) => return Err(damaged(reason)),
-        };
-        let record =
-            postcard::from_bytes(payload).map_err(|error| damaged(format!("not a record: {error}")))?;
-        match record {
+    fn read_entry(&mut self) -> Result<Option<Entry>, LogError> {
+        loop {
+            let offset = self.frames.offset;
+            let next = self.frames.read();
+            let next = next.map_err(|source| LogError::Io { path: self.path.clone(), source })?;
+            let record = match next {
+                Next::Payload(payload) => {
+                    postcard::from_bytes(payload).map_err(|error| format!("not a record: {error}"))
+                }
+                Next::End => return Ok(None),
+                Next::Damaged(reason) => Err(reason),
+            };
+            let taken = record.and_then(|record| self.take(record)).map_err(|reason| {
+                let (path, ticks) = (self.path.clone(), self.ticks);
+                LogError::Damaged { path, offset, reason, ticks }
+            })?;
+            if let ControlFlow::Break(entry) = taken {
+                return Ok(entry);
+            }
+        }
+    }
+
+    /// The entry that a record is, none at the log's end; goes on where it is about those that follow.
+    fn take(&mut self, record: Record) -> Result<ControlFlow<Option<Entry>>, String> {
+        let numbers = self.header.bundle.action_numbers();
+        let entry = match record {
             Record::Tick(record) => {
-                let observation = self.observation(&record).map_err(damaged)?;
+                // Everything that is made of a log takes actions for those of one robot.
+                record.check_counts(numbers)?;
+                let observation = self.observation(&record)?;
+                let index = self.ticks;
                 self.ticks += 1;
-                Ok(Some(Entry::Tick(Box::new(LoggedTick { index: ticks, record: *record, observation }))))
+                Entry::Tick(Box::new(LoggedTick { index, record: *record, observation }))
             }
             Record::Interface(text) => {
-                let interface = Interface::parse(&text).map_err(|error| damaged(error.to_string()))?;
+                let interface = Interface::parse(&text).map_err(|error| error.to_string())?;
+                check_count("an interface with actions", interface.action_numbers(), numbers)?;
                 self.images.clear();
                 self.images.resize_with(interface.camera.len(), ImagePacker::default);
                 self.format = Some(Format::of(interface));
-                self.read_entry(self.frames.offset)
+                return Ok(ControlFlow::Continue(()));
             }
-            Record::Policy(identity) => Ok(Some(Entry::Policy(identity))),
+            Record::Policy(identity) => {
+                check_count("a policy with actions", identity.action_numbers(), numbers)?;
+                Entry::Policy(identity)
+            }
             Record::End { .. } => {
                 self.finished = true;
-                Ok(None)
+                return Ok(ControlFlow::Break(None));
             }
-        }
+        };
+        Ok(ControlFlow::Break(Some(entry)))
     }
 
     fn observation(&mut self, record: &TickRecord) -> Result<Option<OwnedObservation>, String> {

@@ -10,10 +10,10 @@ use rcwm_models::wire::{Format, Observation};
 
 use super::LogError;
 use super::frames::{MAGIC, write_frame, write_start};
+use super::header::{BundleIdentity, Header, Machine};
 use super::pack::{ImagePacker, PackedMask};
 use super::record::{
-    BundleIdentity, Header, KEYFRAME_TICKS, LoggedCall, LoggedOutcome, Machine, Observed, Record, TickRecord,
-    WholeState, digest,
+    KEYFRAME_TICKS, LoggedCall, LoggedOutcome, Observed, Record, TickRecord, WholeState, digest,
 };
 use crate::controller::Fallback;
 use crate::engine::EngineSettings;
@@ -40,10 +40,10 @@ pub struct LogSettings {
 }
 
 impl LogSettings {
-    /// Of a controller that holds the last action and limits no rate.
+    /// Of a controller with the usual settings: the interface's fallback, and no limit of rate beside the interface's.
     #[must_use]
     pub fn new(instance: &str, engine: EngineSettings, sampling: Sampling) -> Self {
-        let (fallback, rate_max) = (Fallback::Hold, None);
+        let (fallback, rate_max) = (Fallback::Interface, None);
         Self { instance: instance.to_owned(), engine, sampling, fallback, rate_max, episodes_max: None }
     }
 }

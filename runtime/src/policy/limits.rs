@@ -1,20 +1,8 @@
 //! What a robot may be commanded, number by number.
 
-use rcwm_models::bundle::{ActionMode, Manifest};
-use rcwm_models::interface::{Action, Fallback, FallbackRule};
+use rcwm_models::bundle::Manifest;
+use rcwm_models::interface::{ActionNumber, Safe};
 use rcwm_models::wire::{ACTION_NUMBERS_MAX, ActionValues};
-
-/// What a number of an action is where there is no decision.
-#[derive(Debug, Clone, Copy, PartialEq, Default)]
-pub enum Safe {
-    /// What was executed last.
-    #[default]
-    Hold,
-    /// What was measured last.
-    HoldMeasured,
-    /// This, in units.
-    Number(f32),
-}
 
 /// What each number of an action may be, in the interface's units.
 #[derive(Debug, Clone, Copy, PartialEq)]
@@ -37,18 +25,19 @@ impl ActionLimits {
     /// The limits of a bundle, whose loading has checked that they are finite and low < high.
     #[must_use]
     pub fn of(manifest: &Manifest) -> Self {
-        let limits = manifest.limits();
-        let actions = &manifest.interface.action;
-        let each = actions.iter().flat_map(|action| std::iter::repeat_n(action, action.elements.len()));
-        let rate_max = |most: Option<f64>| most.map_or(f32::INFINITY, |most| most as f32);
-        let absolute = each.clone().enumerate().filter(|(_, action)| action.mode == ActionMode::Absolute);
+        let (limits, numbers) = (manifest.limits(), manifest.interface.numbers());
+        let each = |of: fn(&ActionNumber) -> f32| numbers.iter().map(of).collect();
+        let absolute = numbers.iter().enumerate().filter(|(_, number)| number.is_absolute);
+        let mut safe = [Safe::default(); ACTION_NUMBERS_MAX];
+        safe.iter_mut().zip(&numbers).for_each(|(to, number)| *to = number.safe);
         Self {
             low: limits.low.into_iter().collect(),
             high: limits.high.into_iter().collect(),
-            rate_max: each.map(|action| rate_max(action.rate_max)).collect(),
+            rate_max: each(|number| number.rate_max),
             absolute: absolute.fold(0, |bits, (at, _)| bits | 1 << at),
-            half_range: actions.iter().flat_map(half_ranges).collect(),
-            safe: safe(actions),
+            // In f64, where no range is infinitely wide.
+            half_range: each(|number| (0.5 * (f64::from(number.high) - f64::from(number.low))) as f32),
+            safe,
         }
     }
 
@@ -69,23 +58,6 @@ impl ActionLimits {
     pub fn clamp(&self, action: ActionValues) -> ActionValues {
         ActionValues::from_fn(action.len(), |i| action[i].clamp(self.low[i], self.high[i]))
     }
-}
-
-fn half_ranges(action: &Action) -> impl Iterator<Item = f32> {
-    action.low.iter().zip(&action.high).map(|(low, high)| (0.5 * (high - low)) as f32)
-}
-
-fn safe(actions: &[Action]) -> [Safe; ACTION_NUMBERS_MAX] {
-    let of = |action: &Action, at: usize| match &action.fallback {
-        Fallback::Rule(FallbackRule::Hold) => Safe::Hold,
-        Fallback::Rule(FallbackRule::HoldMeasured) => Safe::HoldMeasured,
-        Fallback::Rule(FallbackRule::Zero) => Safe::Number(0.0),
-        Fallback::Numbers(numbers) => Safe::Number(numbers[at] as f32),
-    };
-    let mut all = [Safe::default(); ACTION_NUMBERS_MAX];
-    let each = actions.iter().flat_map(|action| (0..action.elements.len()).map(move |at| of(action, at)));
-    all.iter_mut().zip(each).for_each(|(to, safe)| *to = safe);
-    all
 }
 
 #[cfg(test)]

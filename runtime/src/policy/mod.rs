@@ -32,7 +32,7 @@ pub use buffers::{BranchBuffers, Buffers};
 pub use calls::{CALLS_MAX, Call, CallKind, CallOutcome};
 pub use error::PolicyError;
 pub use inputs::{InputReader, Inputs};
-pub use limits::{ActionLimits, Safe};
+pub use limits::ActionLimits;
 pub use noise::Sampling;
 
 pub use recurrent::Graph;

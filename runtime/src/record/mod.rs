@@ -16,6 +16,8 @@ use std::sync::mpsc::{Receiver, SyncSender, TryRecvError, sync_channel};
 use std::thread::JoinHandle;
 use std::time::{Duration, Instant};
 
+use rcwm_models::wire::Format;
+
 use crate::controller::{Tick, TickObserver};
 use crate::policy::Policy;
 use record::Progress;
@@ -24,6 +26,15 @@ use record::Progress;
 const LOOK: Duration = Duration::from_millis(20);
 /// Niceness of the writer, as of all that must not take the processor from the loop: Linux keeps one per thread.
 const NICENESS: i32 = 10;
+
+/// Most bytes of all observations that wait for the writer, and records that may wait however many bytes they take.
+const WAITING_BYTES_MAX: usize = 32 << 20;
+const WAITING_MIN: usize = 4;
+
+/// Records that may wait of a robot with these observations.
+fn records_of(format: &Format) -> usize {
+    (WAITING_BYTES_MAX / format.layout().observation_bytes.max(1)).max(WAITING_MIN)
+}
 
 /// Makes something of the records, in the writer's thread. What goes wrong is kept and told after the run: a sink that has failed takes
 /// what comes and does nothing.
@@ -45,6 +56,8 @@ pub struct Recorder<S> {
     back: Receiver<Box<Record>>,
     #[expect(clippy::vec_box, reason = "records are handed to and fro, not copied")]
     free: Vec<Box<Record>>,
+    /// Records that there are, free or not.
+    records: usize,
     thread: Option<JoinHandle<S>>,
     dropped: Arc<AtomicU64>,
     progress: Progress,
@@ -65,19 +78,20 @@ pub struct Finished<S> {
 pub struct WriterLost(String);
 
 impl<S: Sink> Recorder<S> {
-    /// Records that may wait for the writer: half a second at 1 kHz, about 9 MB.
+    /// Most records that may wait for the writer: half a second at 1 kHz. Of large observations it is fewer, 32 MiB of them.
     pub const RECORDS: usize = 512;
 
     pub fn start(policy: &Policy, sink: S) -> Result<Self, WriterLost> {
         Self::with_records(policy, sink, Self::RECORDS)
     }
 
-    /// The same with another number of records that may wait.
+    /// The same with another number of records that may wait at most.
     pub fn with_records(policy: &Policy, sink: S, records: usize) -> Result<Self, WriterLost> {
-        let records = records.max(1);
+        let format = Format::of(policy.manifest().interface.clone());
+        let records = records.clamp(1, records_of(&format));
         let (full, filled) = sync_channel(records);
         let (give_back, back) = sync_channel(records);
-        let free = (0..records).map(|_| Box::new(Record::new(policy))).collect();
+        let free = (0..records).map(|_| Box::new(Record::new(policy, &format))).collect();
         let (dropped, pictures) = (Arc::new(AtomicU64::new(0)), sink.wants_pictures());
         let dropped_so_far = Arc::clone(&dropped);
         let thread = std::thread::Builder::new()
@@ -85,7 +99,20 @@ impl<S: Sink> Recorder<S> {
             .spawn(move || write(sink, &filled, &give_back, &dropped_so_far))
             .map_err(|error| WriterLost(format!("could not be started: {error}")))?;
         let (full, thread, progress) = (Some(full), Some(thread), Progress::of(policy));
-        Ok(Self { full, back, free, thread, dropped, progress, pictures })
+        Ok(Self { full, back, free, records, thread, dropped, progress, pictures })
+    }
+
+    /// A record that is free, where there are not more than `most`: those beyond are given up. A robot may offer more than the policy
+    /// reads, and its observations take as much memory in every record that is filled.
+    fn take_free(&mut self, most: usize, wait: bool) -> Option<Box<Record>> {
+        loop {
+            // The one that came back last is the likeliest to be in the caches.
+            let free = self.free.pop().or_else(|| if wait { self.back.recv().ok() } else { None })?;
+            if self.records <= most {
+                return Some(free);
+            }
+            self.records -= 1;
+        }
     }
 
     /// Waits until the sink has taken all records.
@@ -101,18 +128,19 @@ impl<S: Sink> Recorder<S> {
 
 impl<S: Sink> TickObserver for Recorder<S> {
     fn ticked(&mut self, tick: &Tick<'_>) {
-        let Some(full) = &self.full else { return };
+        if self.full.is_none() {
+            return;
+        }
         let lockstep = tick.observation.is_some_and(|observation| observation.period_ns == 0);
         self.free.extend(self.back.try_iter());
-        // The one that came back last is the likeliest to be in the caches.
-        let free = self.free.pop().or_else(|| if lockstep { self.back.recv().ok() } else { None });
-        let Some(mut record) = free else {
+        let most = tick.observation.map_or(usize::MAX, |observation| records_of(observation.format()));
+        let Some(mut record) = self.take_free(most, lockstep) else {
             self.progress.dropped += 1;
             self.dropped.fetch_add(1, Ordering::Relaxed);
             return;
         };
         record.fill(&mut self.progress, tick, self.pictures);
-        if full.send(record).is_err() {
+        if self.full.as_ref().is_some_and(|full| full.send(record).is_err()) {
             // The writer has panicked, which `finish` will report.
             self.full = None;
         }

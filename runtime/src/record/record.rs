@@ -1,6 +1,7 @@
 //! What the loop hands over of a tick.
 
 use std::path::PathBuf;
+use std::sync::Arc;
 
 use rcwm_models::bundle::Manifest;
 use rcwm_models::wire::{Action, ActionValues, Format, OwnedObservation};
@@ -82,8 +83,8 @@ impl Progress {
 }
 
 impl Record {
-    pub(super) fn new(policy: &Policy) -> Self {
-        let observation = OwnedObservation::zeroed(&Format::of(policy.manifest().interface.clone()));
+    pub(super) fn new(policy: &Policy, format: &Arc<Format>) -> Self {
+        let observation = OwnedObservation::zeroed(format);
         Self {
             observed: false,
             running: EpisodeResult::start(&observation),

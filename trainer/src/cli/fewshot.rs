@@ -1,7 +1,7 @@
 use std::path::PathBuf;
 use std::process::ExitCode;
 
-use anyhow::Result;
+use anyhow::{Context, Result};
 use indicatif::{ProgressBar, ProgressStyle};
 use rcwm_models::settings::SettingsError;
 use rcwm_models::tasks::task_id;
@@ -107,9 +107,6 @@ impl Fewshot {
 
     /// The settings of a new run, or those of the run to be resumed; with the overrides.
     fn settings(&self, source: Option<&Checkpoint>) -> Result<TrainingSettings> {
-        if let Some(task) = &self.task {
-            task_id(task)?;
-        }
         let mut settings = match source {
             None => Run::settings(&self.out)?,
             Some(source) => {
@@ -128,6 +125,10 @@ impl Fewshot {
             settings.data = absolute(data)?;
         }
         if let Some(task) = &self.task {
+            // A robot's own task is what its folder is called.
+            if !settings.data.join(task).is_dir() {
+                task_id(task).with_context(|| format!("{} has no folder {task}", settings.data.display()))?;
+            }
             settings.task.clone_from(task);
         }
         let resolved = bars::changed(&settings, &self.overrides)?;

@@ -4,8 +4,8 @@ use std::path::{Path, PathBuf};
 
 use ndarray::{ArrayD, IxDyn};
 use rcwm_models::bundle::{
-    Bundle, BundleKind, FORMAT, FileEntry, InitialState, Manifest, NewBundle, PartEntry, PartName,
-    PolicyInputs, Provenance,
+    Bundle, BundleError, BundleKind, FORMAT, FileEntry, InitialState, Manifest, NewBundle, PartEntry,
+    PartName, PolicyInputs, Provenance, WriteError,
 };
 use rcwm_models::interface::Interface;
 use rcwm_models::settings::ModelSettings;
@@ -63,6 +63,10 @@ pub fn write(
 
     let weights = Weights::new(&checkpoint.parameters)?;
     let mut parts = Vec::with_capacity(options.parts.len());
+    let kind = BundleKind::of(settings.kind);
+    if let Some(part) = options.parts.iter().find(|part| !kind.all_parts().any(|known| known == **part)) {
+        return Err(WriteError::from(BundleError::OtherKind { part: *part, kind }).into());
+    }
     for (done, name) in options.parts.iter().enumerate() {
         progress.step(name.as_str(), done, options.parts.len())?;
         let file = new.file(&format!("{name}.onnx"), &part_to_onnx(*name, &weights, settings))?;
@@ -70,7 +74,6 @@ pub fn write(
         let FileEntry { file, bytes, sha256 } = file;
         parts.push(PartEntry { name: *name, file, bytes, sha256, inputs, outputs });
     }
-    let kind = BundleKind::of(settings.kind);
     let initial = initial_tensors(kind, &golden::initial_state(&agent)?);
     let initial = new.file(INITIAL_FILE, &initial.to_bytes()?)?;
     let golden = golden::record(&agent, &options.parts, &scene, options.golden_seed, progress)?;

@@ -1,6 +1,7 @@
 use std::sync::atomic::{AtomicBool, Ordering};
 use std::time::Duration;
 
+use rcwm_models::IMAGE_SIDE;
 use rcwm_models::interface::{ActionMode, Interface, Mismatch};
 use rcwm_models::wire::{
     Action, ActionSource, ActionValues, ControllerLink, LinkError, LinkSettings, ObservationSample, Wait,
@@ -30,9 +31,12 @@ pub struct Client {
     answer: Option<Action>,
 }
 
-/// What the trainer needs of a robot that it acts on: commands of which zeros are no motion, and that may change at once. Whatever else it
-/// offers is recorded.
-fn needs(robot: &Interface) -> Vec<Mismatch> {
+/// Everything in which a robot is not what is needed.
+pub type Unfit = fn(&Interface) -> Vec<Mismatch>;
+
+/// In what a robot is not one that the trainer can record: commands of which zeros are no motion, and that may change at once. Whatever
+/// else it offers is recorded.
+pub fn unfit_to_record(robot: &Interface) -> Vec<Mismatch> {
     let mut found = Vec::new();
     for action in &robot.action {
         let place = format!("action {}", action.name);
@@ -47,16 +51,34 @@ fn needs(robot: &Interface) -> Vec<Mismatch> {
     found
 }
 
+/// In what a robot is not one that the trainer can act on: it looks at the first camera, of its own size.
+pub fn unfit_to_act(robot: &Interface) -> Vec<Mismatch> {
+    let mut found = unfit_to_record(robot);
+    let picture = [IMAGE_SIDE, IMAGE_SIDE, 3];
+    match robot.camera.first() {
+        None => found.push(Mismatch::new("camera", "there is none, and the trainer acts by what it sees")),
+        Some(camera) if camera.shape != picture => {
+            let [height, width, _] = camera.shape;
+            let text = format!(
+                "{height} x {width}, the trainer acts on {IMAGE_SIDE} x {IMAGE_SIDE}; resize on the robot's side"
+            );
+            found.push(Mismatch::new(&format!("camera {}", camera.name), text));
+        }
+        Some(_) => {}
+    }
+    found
+}
+
 impl Client {
     /// Connects to the simulator that was started.
-    pub fn of(process: SimulatorProcess) -> Result<Self, ClientError> {
-        let link = ControllerLink::open(LinkSettings::new(process.instance()), needs)?;
+    pub fn of(process: SimulatorProcess, unfit: Unfit) -> Result<Self, ClientError> {
+        let link = ControllerLink::open(LinkSettings::new(process.instance()), unfit)?;
         Ok(Self { link, process: Some(process), answer: None })
     }
 
     /// Connects to a simulator that runs, or will.
-    pub fn join(instance: &str) -> Result<Self, ClientError> {
-        let link = ControllerLink::open(LinkSettings::new(instance), needs)?;
+    pub fn join(instance: &str, unfit: Unfit) -> Result<Self, ClientError> {
+        let link = ControllerLink::open(LinkSettings::new(instance), unfit)?;
         Ok(Self { link, process: None, answer: None })
     }
 

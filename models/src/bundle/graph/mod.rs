@@ -11,6 +11,7 @@ mod movement;
 mod operators;
 mod policies;
 mod value;
+mod window;
 
 use std::collections::HashMap;
 

@@ -1,10 +1,10 @@
 //! Operators that policies of other libraries use beside ours: recurrent cells, small networks on vectors and pictures.
 
 use super::attributes::{Attributes, axis_of};
-use super::inferred::{Inferred, take};
+use super::inferred::{Inferred, broadcast, floats, reduced, take};
 use super::movement::constant_integers;
-use super::operators::{Window, broadcast, floats, picture_side, reduced};
 use super::value::Value;
+use super::window::{Window, picture_side, small};
 use super::{DType, Limits};
 
 /// Operators of which an input may be left out.
@@ -159,7 +159,7 @@ fn pool(attributes: &mut Attributes<'_>, inputs: &[&Value], averages: bool) -> I
         return Err(format!("shape {:?}, expected 4 dimensions", x.shape));
     };
     let kernel = attributes.ints("kernel_shape")?.ok_or("attribute \"kernel_shape\" is missing")?;
-    let kernel = super::operators::small(kernel, 1, 64)?;
+    let kernel = small(kernel, 1, 64)?;
     attributes.only_int("ceil_mode", 0)?;
     if averages {
         attributes.flag("count_include_pad", false)?;

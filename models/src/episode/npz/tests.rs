@@ -1,5 +1,10 @@
 //! What other programs write, and what nobody should.
 
+use std::io::Write;
+
+use zip::ZipWriter;
+use zip::write::SimpleFileOptions;
+
 use super::*;
 
 /// What another program may have written: arrays by name, with header and bytes of our choice.
@@ -55,9 +60,9 @@ impl Foreign {
 
 #[test]
 fn what_does_not_fit_is_refused_before_any_array_is_unpacked() {
-    // Pictures whose header asks for 1 GiB, of which none is there.
+    // Pictures whose header asks for nearly 1 GiB, of which none is there.
     let mut foreign = Foreign::new();
-    foreign.set("image", "|u1", &[STEPS_MAX, 64, 64, 3], &[]);
+    foreign.set("image", "|u1", &[80_000, 64, 64, 3], &[]);
     assert!(foreign.read().unwrap_err().contains("\"action\""), "{:?}", foreign.read().err());
     foreign.0.retain(|(name, _)| name != "action");
     assert!(foreign.read().unwrap_err().contains("array \"action\" is missing"));
@@ -156,7 +161,20 @@ fn a_camera_that_is_missing_or_of_another_size_is_named() {
     assert!(error.contains("\"image_2\"") && error.contains("[6, 64, 64, 3]"), "{error}");
     let error = Foreign::with("action", "<f4", &[T, 2, 4], &[]).unwrap_err();
     assert!(error.contains("[6, 2, 4]") && error.contains("[T, n]"), "{error}");
-    // Large pictures of as many steps as small ones may have would be more than memory holds.
-    let error = Foreign::with("image", "|u1", &[STEPS_MAX, 128, 128, 3], &[]).unwrap_err();
-    assert!(error.contains("bytes of all cameras"), "{error}");
+    // More than memory should hold.
+    for side in IMAGE_SIDES {
+        let error = Foreign::with("image", "|u1", &[STEPS_MAX, side, side, 3], &[]).unwrap_err();
+        assert!(error.contains("bytes of all cameras"), "{error}");
+    }
+    let error = Foreign::with("image", "|u1", &[T, 96, 96, 3], &[]).unwrap_err();
+    assert!(error.contains("[6, 96, 96, 3]") && error.contains("64 or 128"), "{error}");
+}
+
+#[test]
+fn a_measured_state_without_numbers_is_read_as_none() {
+    assert_eq!(Foreign::with("proprio", "<f4", &[T, 0], &[]).unwrap(), Foreign::new().read().unwrap());
+    let error = Foreign::with("action", "<f4", &[T, 0], &[]).unwrap_err();
+    assert!(error.contains("[6, 0]") && error.contains("from 1 to 64"), "{error}");
+    let error = Foreign::with("proprio", "|O", &[T, 0], &[]).unwrap_err();
+    assert!(error.contains("Python objects"), "{error}");
 }

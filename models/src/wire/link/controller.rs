@@ -12,7 +12,7 @@ use super::direction::{
 };
 use super::domain::{join, make_node, reserve_new};
 use super::error::traffic;
-use super::observer::{await_robot, observation_of};
+use super::observer::observation_of;
 use super::{Ipc, LinkError, LinkSettings, Wait};
 use crate::interface::{Interface, Mismatch};
 use crate::wire::clock::monotonic_ns;
@@ -79,7 +79,7 @@ impl ControllerLink {
         if let Some(robot) = self.robot.get() {
             return Ok(Some(robot));
         }
-        let Some(interface) = await_robot(&self.node, &self.inquirer, timeout)? else { return Ok(None) };
+        let Some(interface) = self.inquirer.await_robot(&self.node, timeout)? else { return Ok(None) };
         let mismatches = (self.needs)(&interface);
         if !mismatches.is_empty() {
             let (instance, robot) = (self.settings.instance.clone(), interface.name);
@@ -173,12 +173,20 @@ impl ControllerLink {
         self.node.try_cleanup_dead_nodes();
     }
 
-    /// Tells the simulator that no further action will come; once told, it is not told again.
+    /// Forgets the robot, which has said that it leaves: the next may be another one.
+    pub fn forget_robot(&mut self) {
+        self.robot.take();
+        self.inquirer.forget();
+    }
+
+    /// Tells the simulator that no further action will come; once told, it is not told again. Where none was found, or it was refused,
+    /// it is told nothing: it may be another controller's.
+    ///
     ///
     /// # Errors
     /// [`LinkError::Traffic`]; dropping the link then tries once more.
     pub fn say_closed(&self) -> Result<(), LinkError> {
-        if !self.said_closed.get() {
+        if self.robot.get().is_some() && !self.said_closed.get() {
             self.inquirer.robot.notify(EVENT_CLOSED)?;
             self.said_closed.set(true);
         }

@@ -107,7 +107,7 @@ impl<H: Header> Direction<H> {
             .max_subscribers(SUBSCRIBERS_MAX)
             .max_nodes(NODES_MAX)
             .open_or_create_with_attributes(&attributes(topic)?)
-            .map_err(|error| Self::data_error(&name, error))?;
+            .map_err(|error| Self::data_error(&name, error, topic.interface_hash))?;
         let event = open_event(node, topic.instance, topic.name)?;
         Ok(Self { name, data, event })
     }
@@ -130,7 +130,11 @@ impl<H: Header> Direction<H> {
         LinkError::OtherVersion { service, expected }
     }
 
-    fn data_error(name: &str, error: PublishSubscribeOpenOrCreateError) -> LinkError {
+    fn data_error(
+        name: &str,
+        error: PublishSubscribeOpenOrCreateError,
+        interface_hash: Option<&str>,
+    ) -> LinkError {
         use iceoryx2::service::builder::publish_subscribe::PublishSubscribeOpenError::{
             IncompatibleAttributes, IncompatibleTypes,
         };
@@ -138,6 +142,12 @@ impl<H: Header> Direction<H> {
         match error {
             PublishSubscribeOpenOrCreateError::PublishSubscribeOpenError(IncompatibleTypes) => {
                 Self::other_version(service)
+            }
+            // Nothing but the version of the wire is said there.
+            PublishSubscribeOpenOrCreateError::PublishSubscribeOpenError(IncompatibleAttributes)
+                if interface_hash.is_none() =>
+            {
+                LinkError::OtherWire { service }
             }
             PublishSubscribeOpenOrCreateError::PublishSubscribeOpenError(IncompatibleAttributes) => {
                 LinkError::OtherInterface { service }
@@ -240,6 +250,14 @@ impl<H: Header> Receiver<H> {
     pub(super) fn take_events(&self) -> Result<Events, LinkError> {
         self.note_events(|note| self.listener.try_wait(note))?;
         Ok(self.pending.take())
+    }
+
+    /// Whether somebody asks for the interface; other signals are kept for the next look.
+    pub(super) fn take_asked(&self) -> Result<bool, LinkError> {
+        self.note_events(|note| self.listener.try_wait(note))?;
+        let events = self.pending.get();
+        self.pending.set(Events { asked: false, ..events });
+        Ok(events.asked)
     }
 
     /// Waits for a message. A message wins over signals that came with it: those are kept for the next call.

@@ -3,6 +3,7 @@
 use std::path::PathBuf;
 
 use crate::interface::{InterfaceError, Mismatch};
+use crate::wire::WIRE;
 
 /// Why a link could not be made or used.
 #[derive(Debug, thiserror::Error)]
@@ -58,6 +59,12 @@ pub enum LinkError {
         /// The type name this program speaks.
         expected: &'static str,
     },
+    /// A peer that is connected speaks another version of the wire.
+    #[error(
+        "{service}: the peer speaks another version of the wire (this program speaks {WIRE}); build simulator, runtime and trainer from \
+         one version"
+    )]
+    OtherWire { service: String },
     /// A peer that is connected speaks for another interface.
     #[error(
         "{service}: a program that is still connected uses another interface; end it first, or choose another --instance"

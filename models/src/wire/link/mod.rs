@@ -66,4 +66,4 @@ pub struct Events {
 }
 
 #[cfg(test)]
-mod tests;
+pub(in crate::wire) mod tests;

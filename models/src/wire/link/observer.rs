@@ -8,33 +8,9 @@ use iceoryx2::prelude::Node;
 
 use super::announce::Inquirer;
 use super::direction::{Direction, Received, Receiver, Topic};
-use super::domain::join;
+use super::domain::{join, reserve_new};
 use super::{Ipc, LinkError, LinkSettings, Wait};
-use crate::interface::Interface;
-use crate::wire::{Action, ActionHeader, ActionValues, Format, ObservationHeader, ObservationSample};
-
-/// How often a robot that is not there yet, or did not listen, is asked again.
-const ASK_EVERY: Duration = Duration::from_millis(250);
-
-/// Asks until the robot has said its interface or the time is up.
-pub(super) fn await_robot(
-    node: &Node<Ipc>,
-    inquirer: &Inquirer,
-    timeout: Duration,
-) -> Result<Option<Interface>, LinkError> {
-    let start = Instant::now();
-    loop {
-        let left = timeout.saturating_sub(start.elapsed());
-        if let Some(interface) = inquirer.wait(left.min(ASK_EVERY))? {
-            return Ok(Some(interface));
-        }
-        Direction::<ObservationHeader>::check_version(node, inquirer.instance(), "observation")?;
-        if start.elapsed() >= timeout {
-            return Ok(None);
-        }
-        inquirer.ask()?;
-    }
-}
+use crate::wire::{Action, ActionHeader, Format, ObservationHeader, ObservationSample};
 
 pub(super) fn observation_of(
     sample: Received<ObservationHeader>,
@@ -52,8 +28,8 @@ pub(super) fn action_of(sample: &Received<ActionHeader>, format: &Format) -> Res
         return Err(LinkError::MessageLength { service: "action", found, expected });
     }
     let ActionHeader { answers, published_ns, source, .. } = *sample.user_header();
-    let numbers: &[f32] = bytemuck::cast_slice(payload);
-    let action = ActionValues::from_fn(numbers.len(), |at| numbers[at]);
+    // Whoever wrote it says where its bytes begin: not always where numbers do.
+    let action = payload.as_chunks().0.iter().map(|bytes| f32::from_ne_bytes(*bytes)).collect();
     Ok(Action { answers, published_ns, source, action })
 }
 
@@ -85,11 +61,11 @@ impl<H: super::direction::Header> Listener<H> {
         if let Some(found) = self.found.get() {
             return Ok(Some(found));
         }
-        let Some(interface) = await_robot(&self.node, &self.inquirer, timeout)? else { return Ok(None) };
+        let Some(interface) = self.inquirer.await_robot(&self.node, timeout)? else { return Ok(None) };
         let format = Format::of(interface);
         let (instance, interface_hash) = (self.settings.instance.as_str(), Some(format.hash()));
         let topic = Topic { instance, name: self.topic, interface_hash, history: false };
-        let receiver = Direction::open(&self.node, &topic)?.receiver()?;
+        let receiver = reserve_new(&self.settings, 0, || Direction::open(&self.node, &topic)?.receiver())?;
         Ok(Some(self.found.get_or_init(|| Found { format, receiver })))
     }
 }

@@ -1,12 +1,13 @@
 //! The simulator's end.
 
+use std::cell::Cell;
 use std::sync::Arc;
 use std::time::{Duration, Instant};
 
 use iceoryx2::prelude::Node;
 
 use super::announce::Announcer;
-use super::direction::{Direction, EVENT_CLOSED, Loan, Receiver, Sender, Topic};
+use super::direction::{Direction, EVENT_CLOSED, Loan, Received, Receiver, Sender, Topic};
 use super::domain::join;
 use super::observer::action_of;
 use super::{Events, Ipc, LinkError, LinkSettings, Wait};
@@ -20,6 +21,7 @@ pub struct SimulatorLink {
     announcer: Announcer,
     observations: Sender<ObservationHeader>,
     actions: Receiver<ActionHeader>,
+    misfits: Cell<u64>,
     // Dropped last: the ports above belong to it.
     node: Node<Ipc>,
 }
@@ -51,7 +53,8 @@ impl SimulatorLink {
             let actions = Direction::open(&node, &topic("action"))?.receiver()?;
             let observations = Direction::open(&node, &topic("observation"))?.sender("simulator", bytes)?;
             let announcer = Announcer::open(&node, instance, format)?;
-            Ok(Self { settings, format: Arc::clone(format), announcer, observations, actions, node })
+            let (format, misfits) = (Arc::clone(format), Cell::new(0));
+            Ok(Self { settings, format, announcer, observations, actions, misfits, node })
         })?;
         link.announcer.announce()?;
         Ok(link)
@@ -118,7 +121,11 @@ impl SimulatorLink {
             let (wait, events) = self.actions.wait(self.settings.spin, left)?;
             let asked = self.tell(events)?;
             let wait = match wait {
-                Wait::Message(sample) => Wait::Message(action_of(&sample, &self.format)?),
+                Wait::Message(sample) => match self.fitting(&sample) {
+                    Some(action) => Wait::Message(action),
+                    None if start.elapsed() < timeout => continue,
+                    None => Wait::TimedOut,
+                },
                 Wait::TimedOut if asked && !events.hello && start.elapsed() < timeout => continue,
                 Wait::TimedOut => Wait::TimedOut,
                 // A controller may come and go; only its absence matters here.
@@ -141,7 +148,22 @@ impl SimulatorLink {
     /// # Errors
     /// [`LinkError::Traffic`].
     pub fn poll_action(&self) -> Result<Option<Action>, LinkError> {
-        self.actions.poll()?.map(|sample| action_of(&sample, &self.format)).transpose()
+        let asked = self.actions.take_asked()?;
+        self.tell(Events { asked, ..Events::default() })?;
+        Ok(self.actions.poll()?.and_then(|sample| self.fitting(&sample)))
+    }
+
+    /// An action of the interface's length; another one is no answer, and is counted.
+    fn fitting(&self, sample: &Received<ActionHeader>) -> Option<Action> {
+        let action = action_of(sample, &self.format).ok();
+        self.misfits.set(self.misfits.get() + u64::from(action.is_none()));
+        action
+    }
+
+    /// Actions that came with another length than the interface's, and were dropped.
+    #[must_use]
+    pub fn misfits(&self) -> u64 {
+        self.misfits.get()
     }
 
     /// Signals since the last look; never blocks.

@@ -1,6 +1,6 @@
 use std::sync::Arc;
 
-use iceoryx2::prelude::ZeroCopySend;
+use iceoryx2::prelude::{AttributeSpecifier, ZeroCopySend};
 
 use super::announce::Announcer;
 use super::direction::{Direction, Topic};
@@ -10,7 +10,7 @@ use crate::interface::{Interface, Mismatch};
 use crate::wire::{Action, ActionHeader, Format, ObservationHeader};
 
 /// Settings under a prefix of their own, which is forgotten at the end.
-struct Domain(LinkSettings);
+pub(in crate::wire) struct Domain(LinkSettings);
 
 impl Drop for Domain {
     fn drop(&mut self) {
@@ -18,15 +18,15 @@ impl Drop for Domain {
     }
 }
 
-fn domain(name: &str) -> (LinkSettings, Domain) {
+pub(in crate::wire) fn domain(name: &str) -> (LinkSettings, Domain) {
     let prefix = Some(format!("rcwm_unit_{}_{name}_", std::process::id()));
     let settings = LinkSettings { instance: name.to_owned(), prefix, spin: Duration::ZERO };
     (settings.clone(), Domain(settings))
 }
 
-const SOON: Duration = Duration::from_secs(5);
+pub(in crate::wire) const SOON: Duration = Duration::from_secs(5);
 
-fn anything(_: &Interface) -> Vec<Mismatch> {
+pub(in crate::wire) fn anything(_: &Interface) -> Vec<Mismatch> {
     Vec::new()
 }
 
@@ -39,7 +39,7 @@ fn pair(settings: &LinkSettings, format: &Arc<Format>) -> (SimulatorLink, Contro
     (simulator, controller)
 }
 
-fn arm() -> Arc<Format> {
+pub(in crate::wire) fn arm() -> Arc<Format> {
     Format::of(Interface::parse(include_str!("../../interface/arm.toml")).unwrap())
 }
 
@@ -164,6 +164,8 @@ fn a_second_simulator_and_a_second_controller_are_refused() {
     });
     let error = error.err().unwrap();
     assert!(matches!(error, LinkError::Taken { role: "controller", .. }), "{error}");
+    // The refused one has gone by now, and the first goes on.
+    assert!(!simulator.poll_events().unwrap().closed, "a refused controller ended another's robot");
 }
 
 #[test]
@@ -214,8 +216,57 @@ fn messages_that_do_not_keep_to_the_interface_are_refused() {
     drop(announcer);
     let simulator = SimulatorLink::open(settings, &format).unwrap();
     actions.send(actions.loan(12).unwrap()).unwrap();
-    let error = simulator.wait_action(SOON).unwrap_err();
-    assert!(matches!(error, LinkError::MessageLength { found: 12, .. }), "{error}");
+    // No answer, and no end of the robot either.
+    let (wait, _) = simulator.wait_action(Duration::from_millis(20)).unwrap();
+    assert!(matches!(wait, Wait::TimedOut) && simulator.misfits() == 1, "{wait:?}");
+    actions.send(actions.loan(12).unwrap()).unwrap();
+    assert!(simulator.poll_action().unwrap().is_none() && simulator.misfits() == 2);
+    actions.send(actions.loan(8).unwrap()).unwrap();
+    assert!(simulator.poll_action().unwrap().is_some());
+}
+
+#[test]
+fn a_controller_that_stays_takes_a_robot_with_another_interface() {
+    let (settings, _domain) = domain("stays");
+    let (simulator, mut controller) = pair(&settings, &Format::metaworld());
+    simulator.close().unwrap();
+    assert!(matches!(controller.wait_observation(SOON).unwrap(), Wait::Closed));
+    controller.forget_robot();
+    let arm = arm();
+    // One that only polls is asked, too.
+    let simulator = SimulatorLink::open(settings, &arm).unwrap();
+    assert_eq!(controller.wait_robot(SOON).unwrap().unwrap(), arm);
+    simulator.publish(|observation| observation.sequence = 3).unwrap();
+    assert!(matches!(controller.wait_observation(SOON).unwrap(), Wait::Message(seen) if seen.sequence == 3));
+}
+
+#[test]
+fn a_robot_that_only_polls_says_its_interface_when_it_is_asked() {
+    let (settings, _domain) = domain("polls");
+    let format = arm();
+    let simulator = SimulatorLink::open(settings.clone(), &format).unwrap();
+    let controller = ControllerLink::open(settings, anything).unwrap();
+    assert!(simulator.poll_action().unwrap().is_none());
+    assert_eq!(controller.wait_robot(SOON).unwrap().unwrap(), format);
+    controller.hello().unwrap();
+    simulator.poll_action().unwrap();
+    assert!(simulator.poll_events().unwrap().hello, "what was not asked for is kept");
+}
+
+#[test]
+fn another_version_of_the_wire_is_named() {
+    let (settings, _domain) = domain("wire");
+    let node = make_node(&settings).unwrap();
+    let name = format!("rcwm/{}/interface", settings.instance);
+    let name = name.as_str().try_into().unwrap();
+    let data = node.service_builder(&name).publish_subscribe::<[u8]>().user_header::<()>();
+    let newer =
+        AttributeSpecifier::new().define(&"rcwm.wire".try_into().unwrap(), &"3".try_into().unwrap()).unwrap();
+    let _newer = data.history_size(1).subscriber_max_buffer_size(1).create_with_attributes(&newer).unwrap();
+    let error = ControllerLink::open(settings.clone(), anything).err().unwrap();
+    assert!(matches!(error, LinkError::OtherWire { .. }), "{error}");
+    let error = SimulatorLink::open(settings, &arm()).err().unwrap();
+    assert!(matches!(error, LinkError::OtherWire { .. }), "{error}");
 }
 
 #[test]

@@ -46,7 +46,7 @@ pub enum BundlingError {
     #[error(
         "{path}: {source}; the robot offers {offers}; --rename FROM=TO gives other names, --carry IN=OUT carries an output on"
     )]
-    DoesNotFit { path: PathBuf, source: BundleError, offers: String },
+    DoesNotFit { path: PathBuf, source: Box<BundleError>, offers: String },
     /// Initial states or golden values are unusable.
     #[error("{path}: {source}")]
     Tensors { path: PathBuf, source: TensorsError },
@@ -125,9 +125,9 @@ pub fn build(request: &Request, place: &Path) -> Result<Bundle, BundlingError> {
         parts: vec![part],
     };
     // Names and sizes are told before anything else.
-    let does_not_fit = |source| BundlingError::DoesNotFit {
+    let does_not_fit = |source: BundleError| BundlingError::DoesNotFit {
         path: request.onnx.clone(),
-        source,
+        source: source.into(),
         offers: adapt::offers(&request.interface),
     };
     manifest.check().map_err(does_not_fit)?;

@@ -51,13 +51,13 @@ pub(super) fn run(arguments: &FilmArguments) -> anyhow::Result<()> {
         film(&mut log, replayer, &arguments.out, arguments.episodes, go_on)
     })?;
     shared::write_json(arguments.json.as_deref(), &filmed)?;
-    let Filmed { films, episodes, broken_episodes, log_damage } = filmed;
+    let Filmed { films, episodes, broken_episodes, broken_because, log_damage } = filmed;
     for path in films.iter().chain(&episodes) {
         rcwm_models::outln!("recorded   {}", path.display());
     }
-    if broken_episodes > 0 {
+    if let Some(because) = broken_because {
         rcwm_models::outln!(
-            "recorded   {broken_episodes} episode(s) without .npz: observations of them were lost"
+            "recorded   {broken_episodes} episode(s) without .npz, the first because of: {because}"
         );
     }
     log_damage

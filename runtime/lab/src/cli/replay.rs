@@ -132,13 +132,13 @@ pub(super) fn with_bar<T>(
 }
 
 fn episode_lines(written: &WrittenEpisodes) -> String {
-    let WrittenEpisodes { files, steps, left_out, present, .. } = written;
+    let WrittenEpisodes { files, steps, left_out, left_out_because, present, .. } = written;
     let mut text = format!("episodes   {} written, {steps} steps", files.len());
     if *present > 0 {
         text += &format!("; {present} were there already");
     }
-    if *left_out > 0 {
-        text += &format!("; {left_out} left out: observations of them were lost");
+    if let Some(because) = left_out_because {
+        text += &format!("; {left_out} left out, the first because of: {because}");
     }
     text.push('\n');
     for file in files.iter().take(5) {

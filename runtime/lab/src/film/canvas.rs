@@ -1,11 +1,14 @@
 //! A small picture to put panels, bars and letters on.
 
-use rcwm_models::IMAGE_SIDE;
+use std::borrow::Cow;
 
 /// Width of a letter with the space after it, in pixels.
 pub(super) const LETTER_WIDTH: usize = 4;
 /// Height of a letter, in pixels.
 pub(super) const LETTER_HEIGHT: usize = 5;
+
+/// What is behind everything.
+pub(super) const BACKGROUND: [u8; 3] = [18, 20, 26];
 
 /// An RGB picture, rows first.
 #[derive(Debug, Clone, PartialEq)]
@@ -36,13 +39,48 @@ impl Canvas {
         }
     }
 
-    /// Puts a 64 x 64 picture with its upper left corner at (x, y).
-    pub(super) fn image(&mut self, x: usize, y: usize, pixel: impl Fn(usize) -> [u8; 3]) {
-        for row in 0..IMAGE_SIDE {
-            for column in 0..IMAGE_SIDE {
-                self.put(x + column, y + row, pixel(row * IMAGE_SIDE + column));
+    /// Puts a picture of these rows and columns, as large as it fits into a square of `side` pixels, with its upper left corner at (x, y).
+    pub(super) fn image(
+        &mut self,
+        [x, y]: [usize; 2],
+        side: usize,
+        [rows, columns]: [usize; 2],
+        pixel: impl Fn(usize) -> [u8; 3],
+    ) {
+        let longest = rows.max(columns).max(1);
+        let shown = |length: usize| (length * side / longest).max(1);
+        for row in 0..shown(rows) {
+            for column in 0..shown(columns) {
+                let at = (row * longest / side) * columns + column * longest / side;
+                self.put(x + column, y + row, pixel(at));
             }
         }
+    }
+
+    /// Puts another canvas with its upper left corner at (x, y).
+    pub(super) fn paste(&mut self, x: usize, y: usize, other: &Self) {
+        for (at, pixel) in other.rgb.as_chunks::<3>().0.iter().enumerate() {
+            self.put(x + at % other.width, y + at / other.width, *pixel);
+        }
+    }
+
+    /// The same on a canvas of this size, in its upper left corner.
+    pub(super) fn grown(&self, width: usize, height: usize) -> Cow<'_, Self> {
+        if (self.width, self.height) == (width, height) {
+            return Cow::Borrowed(self);
+        }
+        let mut large = Self::new(width, height, BACKGROUND);
+        large.paste(0, 0, self);
+        Cow::Owned(large)
+    }
+
+    /// The square of `side` pixels with its upper left corner at (x, y), all of which is inside.
+    pub(super) fn part(&self, [x, y]: [usize; 2], side: usize) -> Self {
+        let row = |row: usize| {
+            let at = 3 * (row * self.width + x);
+            &self.rgb[at..at + 3 * side]
+        };
+        Self { width: side, height: side, rgb: (y..y + side).flat_map(row).copied().collect() }
     }
 
     /// Writes capital letters, digits and a few signs; anything else is a space.
@@ -133,6 +171,23 @@ mod tests {
     #[test]
     fn enlarging_repeats_pixels_both_ways() {
         assert_eq!(enlarge(&[1, 2, 3, 4], 2, 2), [1, 1, 2, 2, 1, 1, 2, 2, 3, 3, 4, 4, 3, 3, 4, 4]);
+    }
+
+    #[test]
+    fn pictures_of_any_size_fill_a_square_along_their_longer_side() {
+        for (rows, columns, filled) in [(8, 8, (8, 8)), (16, 32, (4, 8)), (2, 1, (8, 4)), (4000, 3, (8, 1))] {
+            let mut canvas = Canvas::new(10, 10, [0; 3]);
+            canvas.image([1, 1], 8, [rows, columns], |pixel| {
+                assert!(pixel < rows * columns);
+                [if pixel == 0 { 1 } else { 2 }; 3]
+            });
+            let part = canvas.part([1, 1], 8);
+            let is_set = |x: usize, y: usize| part.rgb[3 * (8 * y + x)] > 0;
+            let width = (0..8).filter(|x| is_set(*x, 0)).count();
+            assert_eq!(((0..8).filter(|y| is_set(0, *y)).count(), width), filled);
+            assert_eq!(part.rgb[0], 1);
+            assert_eq!(canvas.rgb.iter().filter(|byte| **byte > 0).count(), 3 * filled.0 * filled.1);
+        }
     }
 
     #[test]

@@ -1,18 +1,14 @@
 //! Films (GIF) and film strips (PNG).
 
+use std::borrow::Cow;
 use std::path::Path;
 
-use rcwm_models::IMAGE_SIDE;
 use rcwm_models::files::write_atomic;
 
 use super::FilmError;
 use super::canvas::{Canvas, enlarge};
 use rcwm_models::picture::write_png;
 
-/// Screen pixels per pixel of the observation in a film.
-const FILM_SCALE: usize = 3;
-/// The same in a strip.
-const STRIP_SCALE: usize = 2;
 const STRIP_FRAMES: usize = 10;
 /// Shortest time between two frames: enough to follow an arm, at a third of the size of every tick.
 const FRAME_CS_MIN: f64 = 7.5;
@@ -24,9 +20,18 @@ const PALETTE_FRAMES: usize = 6;
 /// One pixel in this many trains the palette: 1 is slowest and best, 30 fastest.
 const PALETTE_SAMPLING: i32 = 10;
 
-/// Writes frames of `rate_hz` as a film that plays at about real speed, leaving out frames where the rate is too high.
-pub(super) fn write_film(path: &Path, frames: &[Canvas], rate_hz: f64) -> Result<(), FilmError> {
-    let Some(first) = frames.first() else { return Ok(()) };
+/// Writes frames of `rate_hz`, `scale` times as large, as a film that plays at about real speed, leaving out frames where the rate is too
+/// high. Where a policy or a robot took over that shows more or less, the film is as large as the largest frame.
+pub(super) fn write_film(
+    path: &Path,
+    frames: &[&Canvas],
+    rate_hz: f64,
+    scale: usize,
+) -> Result<(), FilmError> {
+    let largest = |side: fn(&Canvas) -> usize| frames.iter().map(|frame| side(frame)).max();
+    let (Some(width), Some(height)) = (largest(|frame| frame.width), largest(|frame| frame.height)) else {
+        return Ok(());
+    };
     let period_cs = 100.0 / rate_hz;
     let every = (FRAME_CS_MIN / period_cs).ceil().max(1.0) as usize;
     let delay = (period_cs * every as f64).round().clamp(1.0, 1000.0) as u16;
@@ -35,23 +40,23 @@ pub(super) fn write_film(path: &Path, frames: &[Canvas], rate_hz: f64) -> Result
             path: path.to_path_buf(),
             reason: format!("a picture of {pixels} pixels is too wide for a film"),
         };
-        u16::try_from(pixels * FILM_SCALE).map_err(too_wide)
+        u16::try_from(pixels * scale).map_err(too_wide)
     };
-    let (width, height) = (side(first.width)?, side(first.height)?);
+    let screen = (side(width)?, side(height)?);
     let failed = |error: ::gif::EncodingError| FilmError::Picture {
         path: path.to_path_buf(),
         reason: error.to_string(),
     };
-    let shown: Vec<&Canvas> = frames.iter().step_by(every).collect();
+    let shown: Vec<_> = frames.iter().step_by(every).map(|frame| frame.grown(width, height)).collect();
     let mut colours = Colours::of(&shown);
     let mut film = Vec::new();
-    let mut encoder = ::gif::Encoder::new(&mut film, width, height, &colours.palette).map_err(failed)?;
+    let mut encoder = ::gif::Encoder::new(&mut film, screen.0, screen.1, &colours.palette).map_err(failed)?;
     encoder.set_repeat(::gif::Repeat::Infinite).map_err(failed)?;
     for frame in shown {
-        let buffer = enlarge(&colours.changes(frame), frame.width, FILM_SCALE).into();
+        let buffer = enlarge(&colours.changes(&frame), width, scale).into();
         let frame = ::gif::Frame {
-            width,
-            height,
+            width: screen.0,
+            height: screen.1,
             delay,
             transparent: Some(AS_BEFORE),
             buffer,
@@ -74,7 +79,7 @@ struct Colours {
 }
 
 impl Colours {
-    fn of(frames: &[&Canvas]) -> Self {
+    fn of(frames: &[Cow<'_, Canvas>]) -> Self {
         let every = frames.len().div_ceil(PALETTE_FRAMES).max(1);
         let sample: Vec<u8> = frames
             .iter()
@@ -121,21 +126,20 @@ pub(super) fn strip_choice(count: usize) -> Vec<usize> {
     }
 }
 
-/// Writes a strip: one column a chosen frame, one row a panel.
-pub(super) fn write_strip(path: &Path, columns: &[&[Canvas]]) -> Result<(), FilmError> {
-    let rows = columns.first().map_or(0, |column| column.len());
+/// Writes a strip, `scale` times as large: one column a chosen frame, one row a panel.
+pub(super) fn write_strip(path: &Path, columns: &[Vec<Canvas>], scale: usize) -> Result<(), FilmError> {
+    let rows = columns.iter().map(Vec::len).max().unwrap_or(0);
+    let cell = columns.iter().flatten().map(|panel| panel.width + 1).max().unwrap_or(0);
     if rows == 0 {
         return Ok(());
     }
-    let cell = IMAGE_SIDE + 1;
     let mut strip = Canvas::new(columns.len() * cell - 1, rows * cell - 1, [255; 3]);
     for (x, column) in columns.iter().enumerate() {
         for (y, panel) in column.iter().enumerate() {
-            let pixels = panel.rgb.as_chunks::<3>().0;
-            strip.image(x * cell, y * cell, |pixel| pixels[pixel]);
+            strip.paste(x * cell, y * cell, panel);
         }
     }
-    let strip = strip.enlarged(STRIP_SCALE);
+    let strip = strip.enlarged(scale);
     let side = |pixels: usize| u32::try_from(pixels).unwrap_or(u32::MAX);
     Ok(write_png(path, [side(strip.width), side(strip.height)], &strip.rgb)?)
 }
@@ -161,7 +165,7 @@ mod tests {
         let first = Canvas::new(8, 8, red);
         let mut second = first.clone();
         second.fill(2, 3, 1, 1, blue);
-        let mut colours = Colours::of(&[&first, &second]);
+        let mut colours = Colours::of(&[Cow::Borrowed(&first), Cow::Borrowed(&second)]);
         assert!(colours.changes(&first).iter().all(|number| *number != AS_BEFORE));
         let changes = colours.changes(&second);
         assert_eq!(changes.iter().filter(|number| **number != AS_BEFORE).count(), 1);
@@ -172,8 +176,10 @@ mod tests {
     fn a_film_has_the_size_and_the_frames_it_should() {
         let folder = tempfile::tempdir().unwrap();
         let path = folder.path().join("film.gif");
-        let frames: Vec<_> = (0..8).map(|i| Canvas::new(20, 10, [i * 30, 0, 0])).collect();
-        write_film(&path, &frames, 40.0).unwrap();
+        // One of them is of a policy that shows less.
+        let width = |i| if i == 3 { 15 } else { 20 };
+        let frames: Vec<_> = (0..8).map(|i| Canvas::new(width(i), 10, [i * 30, 0, 0])).collect();
+        write_film(&path, &frames.iter().collect::<Vec<_>>(), 40.0, 3).unwrap();
         let mut decoder = ::gif::DecodeOptions::new().read_info(File::open(&path).unwrap()).unwrap();
         assert_eq!((decoder.width(), decoder.height()), (60, 30));
         let mut shown = 0;

@@ -16,9 +16,9 @@ mod panels;
 
 use std::path::{Path, PathBuf};
 
-use rcwm_models::IMAGE_BYTES;
-use rcwm_models::bundle::{BundleKind, PartName};
+use rcwm_models::bundle::{BundleKind, Manifest, PartName};
 use rcwm_models::files::FileError;
+use rcwm_models::interface::Camera;
 use rcwm_models::lock::{Lock, LockError};
 use rcwm_models::wire::{Observation, ObservationFlags};
 use rcwm_runtime::controller::EpisodeResult;
@@ -27,14 +27,12 @@ use rcwm_runtime::log::{Entry, LogError, LogReader, LoggedTick};
 use serde::Serialize;
 
 use crate::log::{LoggedEpisode, ReplayError, Replayer};
-use canvas::Canvas;
-use panels::{Decoded, Shown, film_frame, strip_panels};
+use panels::{Decoded, Frame, Shown, View, film_frame};
 use rcwm_models::picture::PictureError;
 
-/// Longest film, in ticks; longer episodes are filmed to here and kept whole as `.npz`.
+/// Longest film, in ticks and in bytes of its frames; longer episodes are filmed to here and kept whole as `.npz`.
 const FILM_TICKS_MAX: usize = 1000;
-/// Pace of a film of a run in lock-step without a bundle, in Hz: Meta-World's.
-const RATE_HZ: f64 = 40.0;
+const FILM_BYTES_MAX: usize = 512 << 20;
 
 /// Why nothing could be filmed.
 #[derive(Debug, thiserror::Error)]
@@ -48,9 +46,20 @@ pub enum FilmError {
     /// An episode could not be written.
     #[error("film: {0}")]
     Episode(#[from] rcwm_models::episode::EpisodeError),
-    /// Pictures of another size.
-    #[error("film: pictures of {found} bytes; films are drawn of 64 x 64 x 3 ({expected} bytes)")]
-    Size { found: usize, expected: usize },
+    /// The robot shows nothing.
+    #[error(
+        "film: the robot {robot} has no camera, there is nothing to film; `rcwm-lab replay` and `rcwm-lab telemetry` use such a log"
+    )]
+    NoCamera {
+        /// Its interface's name.
+        robot: String,
+    },
+    /// What the policy sees is not what the robot shows.
+    #[error(
+        "film: camera {camera} of the robot {robot} is {found}, the policy sees {expected}; name the bundle that was made for this \
+         robot, or leave --bundle out to film what was seen"
+    )]
+    Camera { robot: String, camera: String, found: String, expected: String },
     /// Somebody else writes into the folder.
     #[error("film: {0}")]
     Lock(#[from] LockError),
@@ -78,8 +87,10 @@ pub struct Filmed {
     pub films: Vec<PathBuf>,
     /// Episodes written.
     pub episodes: Vec<PathBuf>,
-    /// Episodes not written because observations of them were lost.
+    /// Episodes not written: observations of them were lost, or they are none that could be read again.
     pub broken_episodes: u64,
+    /// Why the first of them was not.
+    pub broken_because: Option<String>,
     /// Where the log is damaged; all before it was filmed.
     pub log_damage: Option<String>,
 }
@@ -117,10 +128,8 @@ pub fn film(
 struct Filming<'a> {
     folder: &'a Path,
     replayer: Option<Replayer>,
-    decoder: Option<Box<dyn Part>>,
-    decoded: Decoded,
-    /// Films play at the rate of the policy unless the robot says its own.
-    rate_hz: f64,
+    /// With room for its outputs.
+    decoder: Option<(Box<dyn Part>, Decoded)>,
     filmed: Filmed,
     /// Number of the next episode.
     number: u64,
@@ -131,8 +140,9 @@ struct Filming<'a> {
 
 /// The episode being filmed.
 struct Running {
-    film: Vec<Canvas>,
-    panels: Vec<Vec<Canvas>>,
+    film: Vec<Frame>,
+    film_bytes: usize,
+    rate_hz: f64,
     episode: LoggedEpisode,
     result: EpisodeResult,
 }
@@ -143,8 +153,6 @@ impl<'a> Filming<'a> {
             folder,
             replayer,
             decoder: None,
-            decoded: Decoded::new(),
-            rate_hz: RATE_HZ,
             filmed: Filmed::default(),
             number: next_number(folder),
             episodes_left: Some(episodes_max),
@@ -158,11 +166,13 @@ impl<'a> Filming<'a> {
     fn load_decoder(&mut self) -> Result<(), FilmError> {
         let Some(replayer) = &self.replayer else { return Ok(()) };
         let bundle = replayer.bundle();
-        self.rate_hz = bundle.manifest.interface.rate_hz;
+        self.decoder = None;
         // What is drawn is what two branches see.
-        let part = bundle.part(PartName::Decoder).filter(|_| bundle.manifest.kind == BundleKind::Rcwm);
-        self.decoder =
-            part.map(|_| engine::load(bundle, PartName::Decoder, replayer.engine())).transpose()?;
+        let draws = bundle.manifest.kind == BundleKind::Rcwm && bundle.part(PartName::Decoder).is_some();
+        if let (Some(model), true) = (&bundle.manifest.model, draws) {
+            let decoder = engine::load(bundle, PartName::Decoder, replayer.engine())?;
+            self.decoder = Some((decoder, Decoded::of(model)));
+        }
         Ok(())
     }
 
@@ -188,35 +198,70 @@ impl<'a> Filming<'a> {
         if self.episodes_left.is_none() {
             return Ok(());
         }
+        let views = self.views(observation)?;
         self.decode()?;
-        if observation.period_ns > 0 {
-            self.rate_hz = 1e9 / observation.period_ns as f64;
-        }
+        let format = observation.format();
         let running = self.running.get_or_insert_with(|| Running::start(observation));
+        running.rate_hz = match observation.period_ns {
+            0 => format.interface().rate_hz,
+            period_ns => 1e9 / period_ns as f64,
+        };
         running.result.add(observation);
-        let image = observation.image(0);
-        if image.len() != IMAGE_BYTES {
-            return Err(FilmError::Size { found: image.len(), expected: IMAGE_BYTES });
-        }
+        let mut action = format.zeros();
+        // Of what is no number, or was not sent, no bar is drawn.
+        let _ = format.normaliser().from_units(&tick.record.answer.action, &mut action);
         let shown = Shown {
-            image,
-            decoded: self.decoder.is_some().then_some(&self.decoded),
-            action: tick.record.answer.action,
+            views: &views,
+            decoded: self.decoder.as_ref().map(|(_, decoded)| decoded),
+            action: &action,
             source: tick.record.answer.source,
             step: observation.step,
             return_sum: running.result.return_sum,
             success: running.result.success,
         };
-        if running.film.len() < FILM_TICKS_MAX {
-            running.film.push(film_frame(&shown));
-            running.panels.push(strip_panels(&shown));
+        if running.film.len() < FILM_TICKS_MAX && running.film_bytes < FILM_BYTES_MAX {
+            let frame = film_frame(&shown);
+            running.film_bytes += frame.canvas.rgb.len();
+            running.film.push(frame);
         }
         running.episode.add(observation, tick.record.dropped_before > 0 && !tick.record.is_first);
         if observation.is(ObservationFlags::LAST) { self.finish() } else { Ok(()) }
     }
 
+    /// What is shown of an observation: the cameras that the policy reads, in its order; without a policy all of the robot.
+    fn views<'o>(&self, observation: &Observation<'o>) -> Result<Vec<View<'o>>, FilmError> {
+        let robot = observation.format().interface();
+        let view = |at: usize| {
+            let Camera { name, shape: [rows, columns, _], .. } = &robot.camera[at];
+            View { name, size: [*rows, *columns], image: observation.image(at) }
+        };
+        let Some(replayer) = &self.replayer else {
+            if robot.camera.is_empty() {
+                return Err(FilmError::NoCamera { robot: robot.name.clone() });
+            }
+            return Ok((0..robot.camera.len()).map(view).collect());
+        };
+        let Manifest { interface, policy, .. } = &replayer.bundle().manifest;
+        let named = |name: &String| interface.camera.iter().find(|camera| camera.name == *name);
+        let found = |needed: &Camera| {
+            let at = robot.camera.iter().position(|camera| camera.name == needed.name);
+            match at.filter(|at| robot.camera[*at].shape == needed.shape) {
+                Some(at) => Ok(view(at)),
+                None => Err(FilmError::Camera {
+                    robot: robot.name.clone(),
+                    camera: needed.name.clone(),
+                    found: at.map_or_else(|| "missing".to_owned(), |at| robot.camera[at].size()),
+                    expected: needed.size(),
+                }),
+            }
+        };
+        policy.inputs.iter().filter_map(named).map(found).collect()
+    }
+
     fn decode(&mut self) -> Result<(), FilmError> {
-        let (Some(decoder), Some(replayer)) = (&mut self.decoder, &self.replayer) else { return Ok(()) };
+        let (Some((decoder, decoded)), Some(replayer)) = (&mut self.decoder, &self.replayer) else {
+            return Ok(());
+        };
         let [robot, environment] = replayer.policy().state().branches.as_slice() else { return Ok(()) };
         let inputs = [
             Input::I64(&robot.z),
@@ -224,10 +269,7 @@ impl<'a> Filming<'a> {
             Input::I64(&environment.z),
             Input::F32(&environment.h),
         ];
-        let Decoded { image, robot_image, robot_mask, environment_image, environment_mask } =
-            &mut self.decoded;
-        let outputs = [image, robot_image, robot_mask, environment_image, environment_mask];
-        Ok(decoder.run(&inputs, &mut outputs.map(|values| Output::F32(values)))?)
+        Ok(decoder.run(&inputs, &mut decoded.outputs().map(Output::F32))?)
     }
 
     /// Writes the episode that is over.
@@ -239,16 +281,21 @@ impl<'a> Filming<'a> {
         let path = |ending: &str| self.folder.join(format!("episode-{number:04}.{ending}"));
         // The data before the pictures: on a full disk it is what must not be lost.
         match running.episode.finish() {
-            Some(episode) => {
+            Ok(episode) => {
                 episode.write(&path("npz"))?;
                 self.filmed.episodes.push(path("npz"));
             }
-            None => self.filmed.broken_episodes += 1,
+            Err(refused) => {
+                self.filmed.broken_episodes += 1;
+                self.filmed.broken_because.get_or_insert(refused.to_string());
+            }
         }
-        gif::write_film(&path("gif"), &running.film, self.rate_hz)?;
-        let chosen = gif::strip_choice(running.panels.len());
-        let columns: Vec<_> = chosen.into_iter().map(|index| running.panels[index].as_slice()).collect();
-        gif::write_strip(&path("png"), &columns)?;
+        let Some(first) = running.film.first() else { return Ok(()) };
+        let frames: Vec<_> = running.film.iter().map(|frame| &frame.canvas).collect();
+        gif::write_film(&path("gif"), &frames, running.rate_hz, first.film_scale())?;
+        let chosen = gif::strip_choice(frames.len());
+        let columns: Vec<_> = chosen.into_iter().map(|index| running.film[index].strip()).collect();
+        gif::write_strip(&path("png"), &columns, first.strip_scale())?;
         self.filmed.films.push(path("gif"));
         Ok(())
     }
@@ -258,7 +305,8 @@ impl Running {
     fn start(observation: &Observation<'_>) -> Self {
         Self {
             film: Vec::new(),
-            panels: Vec::new(),
+            film_bytes: 0,
+            rate_hz: observation.format().interface().rate_hz,
             episode: LoggedEpisode::start(observation),
             result: EpisodeResult::start(observation),
         }

@@ -19,8 +19,10 @@ pub struct WrittenEpisodes {
     pub present: u64,
     /// Steps in them.
     pub steps: u64,
-    /// Episodes left out: observations of them were lost, or they are a single observation.
+    /// Episodes left out: observations of them were lost, they are a single observation, or too long.
     pub left_out: u64,
+    /// Why the first of them was.
+    pub left_out_because: Option<String>,
     /// Where the log is damaged; all before it was used.
     pub log_damage: Option<String>,
 }
@@ -30,13 +32,14 @@ pub struct LoggedEpisode {
     builder: EpisodeBuilder,
     task: &'static str,
     next_step: u32,
-    broken: bool,
+    /// Why it is no episode.
+    refused: Option<EpisodeError>,
 }
 
 /// Writes every episode of a log of which no observation was lost, one folder a task.
 ///
 /// # Errors
-/// [`LogError::Io`] or [`LogError::Episode`].
+/// [`LogError::Io`], or [`ReplayError::Episode`] also where the robot is one of which no episode is made.
 pub fn write_episodes(
     log: &mut LogReader,
     folder: &Path,
@@ -81,23 +84,36 @@ impl LoggedEpisode {
     #[must_use]
     pub fn start(observation: &Observation<'_>) -> Self {
         let task = task_name(observation.task);
-        Self { builder: EpisodeBuilder::new(), task, next_step: observation.step, broken: false }
+        Self { builder: EpisodeBuilder::new(), task, next_step: observation.step, refused: None }
     }
 
-    /// Adds an observation; after a `gap`, or another step than the next, the episode is broken.
+    /// Adds an observation; after a `gap`, another step than the next, or one that is refused it is no episode any more.
     pub fn add(&mut self, observation: &Observation<'_>, gap: bool) {
         // A transition over a gap would teach the trainer a dynamics that does not exist.
-        self.broken |= gap || observation.step != self.next_step;
+        let lost = gap || observation.step != self.next_step;
         self.next_step = observation.step.wrapping_add(1);
-        if !self.broken {
-            self.broken = self.builder.push(observation).is_err();
+        if self.refused.is_some() {
+            return;
+        }
+        self.refused = match lost {
+            true => Some(EpisodeError::Order("observations were lost".into())),
+            false => self.builder.push(observation).err(),
+        };
+        if self.refused.is_some() {
+            // Nobody needs what was gathered.
+            self.builder = EpisodeBuilder::new();
         }
     }
 
-    /// The episode, if no observation of it was lost.
-    #[must_use]
-    pub fn finish(mut self) -> Option<Episode> {
-        self.builder.finish().filter(|_| !self.broken)
+    /// The episode.
+    ///
+    /// # Errors
+    /// Why it is none.
+    pub fn finish(mut self) -> Result<Episode, EpisodeError> {
+        match self.refused {
+            Some(refused) => Err(refused),
+            None => self.builder.finish().ok_or_else(|| EpisodeError::Order("nothing was observed".into())),
+        }
     }
 }
 
@@ -110,9 +126,16 @@ fn finish(
 ) -> Result<(), ReplayError> {
     let Some(running) = running else { return Ok(()) };
     let task = running.task;
-    let Some(episode) = running.finish().filter(|episode| episode.len() > 1) else {
-        written.left_out += 1;
-        return Ok(());
+    let episode = match running.finish() {
+        Ok(episode) if episode.len() > 1 => episode,
+        // Nothing of this robot will ever be written.
+        Err(refused @ EpisodeError::Robot { .. }) => return Err(refused.into()),
+        left_out => {
+            written.left_out += 1;
+            let because = left_out.map_or_else(|error| error.to_string(), |_| "a single observation".into());
+            written.left_out_because.get_or_insert(because);
+            return Ok(());
+        }
     };
     let folder = folder.join(task);
     std::fs::create_dir_all(&folder).map_err(|source| LogError::Io { path: folder.clone(), source })?;

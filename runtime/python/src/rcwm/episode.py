@@ -7,7 +7,7 @@
 | `reward` | f32 | [T] | of that transition |
 | `is_first`, `is_last`, `is_terminal`, `success` | bool | [T] | |
 | `pushed` | bool | [T] | the action was a push off course and no example of what to do |
-| `proprio` | f32 | [T, n] | all states in the interface's order, in its units |
+| `proprio` | f32 | [T, n] | all states in the interface's order, in its units; left out where there is none |
 | `robot_mask`, `robot_mask_2`, ... | u8 | [T, rows, columns, 1] | optional; 1 where the robot is |
 | `interface` | text | [1] | the interface's canonical text |
 
@@ -71,8 +71,9 @@ class Episode:
         out |= {
             "action": _scaled(self.interface, self.action, self.is_first),
             "reward": self.reward,
-            "proprio": self.proprio,
         }
+        if self.interface.state_numbers:
+            out["proprio"] = self.proprio
         out |= {key: getattr(self, key) for key in FLAGS}
         out["interface"] = np.array([self.interface.canonical()])
         return out
@@ -163,6 +164,8 @@ def read(path: Path, expected: Interface | None = None) -> Episode:
     steps = len(_get(path, arrays, "reward").reshape(-1))
     if not 1 <= steps <= STEPS_MAX:
         raise EpisodeError(f"episode {path}: {steps} steps; expected 1 to {STEPS_MAX}")
+    if not robot.state_numbers:
+        arrays["proprio"] = np.zeros((steps, 0), np.float32)
     numbers = {
         "action": (steps, robot.action_numbers),
         "proprio": (steps, robot.state_numbers),

@@ -3,10 +3,11 @@
 use std::time::Duration;
 
 use rcwm_models::ACTION_LEN;
+use rcwm_models::interface::Safe;
 use rcwm_models::wire::{ACTION_NUMBERS_MAX, ActionSource, Format, OwnedObservation};
 use rcwm_runtime::controller::{Fallback, SurpriseLimits, TickLimits};
 use rcwm_runtime::pacing::PacingSettings;
-use rcwm_runtime::policy::{ActionLimits, Safe};
+use rcwm_runtime::policy::ActionLimits;
 
 use super::due::LOOKS_MAX;
 use super::*;

@@ -1,0 +1,163 @@
+//! What a robot may execute, whoever commands it: a last look on the robot's own side.
+
+use crate::interface::{ActionNumber, Interface, Safe};
+use crate::wire::ActionValues;
+
+/// Holds what was executed last; all actions are in the interface's units.
+#[derive(Debug, Clone)]
+pub struct Guard {
+    numbers: Vec<ActionNumber>,
+    /// NaN where it is not known: a position that is not measured, before the first command.
+    last: ActionValues,
+    /// Something was executed in this episode.
+    commanded: bool,
+}
+
+/// Why an answer is not executed.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, thiserror::Error)]
+pub enum Refused {
+    #[error("not finite")]
+    NotFinite,
+    #[error("out of limits")]
+    OutOfLimits,
+    #[error("of another length")]
+    Length,
+}
+
+/// By how much of its range an answer may be beyond a limit and count as rounded.
+const ROUNDING: f64 = 1e-6;
+
+impl Guard {
+    #[must_use]
+    pub fn new(interface: &Interface) -> Self {
+        let numbers = interface.numbers();
+        Self { last: ActionValues::zeros(numbers.len()), numbers, commanded: false }
+    }
+
+    /// Begins an episode: what counts as executed before it. Zeros, or a position as it is measured; all zeros where that is not known,
+    /// which says that nothing was executed.
+    pub fn begin(&mut self, state: &[f32]) -> ActionValues {
+        self.commanded = false;
+        self.last = self.each(|number| match measured(number, state) {
+            Some(measured) if number.is_absolute => measured.clamp(number.low, number.high),
+            _ if number.is_absolute => f32::NAN,
+            _ => 0.0_f32.clamp(number.low, number.high),
+        });
+        if self.last.is_finite() { self.last } else { ActionValues::zeros(self.last.len()) }
+    }
+
+    /// What is executed of an answer: itself, changed by no more than `rate_max`.
+    ///
+    /// # Errors
+    /// Why nothing of it is executed.
+    pub fn accept(&mut self, action: &[f32]) -> Result<ActionValues, Refused> {
+        if action.len() != self.numbers.len() {
+            return Err(Refused::Length);
+        }
+        if !action.iter().all(|x| x.is_finite()) {
+            return Err(Refused::NotFinite);
+        }
+        let is_near = |(number, x): (&ActionNumber, &f32)| {
+            let (x, low, high) = (f64::from(*x), f64::from(number.low), f64::from(number.high));
+            let room = ROUNDING * (high - low);
+            (low - room..=high + room).contains(&x)
+        };
+        if !self.numbers.iter().zip(action).all(is_near) {
+            return Err(Refused::OutOfLimits);
+        }
+        self.commanded = true;
+        self.last = ActionValues::from_fn(action.len(), |at| {
+            let (number, last) = (&self.numbers[at], self.last[at]);
+            let wanted = action[at].clamp(number.low, number.high);
+            if last.is_nan() { wanted } else { wanted.clamp(last - number.rate_max, last + number.rate_max) }
+        });
+        Ok(self.last)
+    }
+
+    /// The interface's safe action for a measured state; none where it is to hold what is not known.
+    pub fn rest(&mut self, state: &[f32]) -> Option<ActionValues> {
+        let (last, commanded) = (self.last, self.commanded);
+        let safe = |at: usize, number: &ActionNumber| match number.safe {
+            Safe::Number(safe) => safe,
+            Safe::Hold if commanded => last[at],
+            Safe::Hold | Safe::HoldMeasured => measured(number, state).unwrap_or(f32::NAN),
+        };
+        let rest: ActionValues =
+            self.numbers.iter().enumerate().map(|(at, number)| safe(at, number)).collect();
+        if !rest.is_finite() {
+            return None;
+        }
+        self.commanded = true;
+        self.last = self.each_of(&rest, |number, rest| rest.clamp(number.low, number.high));
+        Some(self.last)
+    }
+
+    /// What the robot has made of the action that it was given.
+    ///
+    /// # Errors
+    /// Why it is no action.
+    pub fn executed(&mut self, action: &ActionValues) -> Result<(), Refused> {
+        if action.len() != self.numbers.len() {
+            return Err(Refused::Length);
+        }
+        if !action.is_finite() {
+            return Err(Refused::NotFinite);
+        }
+        self.last = *action;
+        Ok(())
+    }
+
+    fn each(&self, of: impl Fn(&ActionNumber) -> f32) -> ActionValues {
+        self.numbers.iter().map(of).collect()
+    }
+
+    fn each_of(&self, action: &ActionValues, of: impl Fn(&ActionNumber, f32) -> f32) -> ActionValues {
+        self.numbers.iter().zip(action.iter()).map(|(number, x)| of(number, *x)).collect()
+    }
+}
+
+fn measured(number: &ActionNumber, state: &[f32]) -> Option<f32> {
+    number.measured.and_then(|at| state.get(at).copied()).filter(|x| x.is_finite())
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    /// Two joints in radians, measured, by no more than 0.05 a step.
+    fn arm() -> Guard {
+        Guard::new(&Interface::parse(include_str!("../../interface/arm.toml")).unwrap())
+    }
+
+    #[test]
+    fn an_arm_starts_from_where_it_is_measured_and_moves_no_faster_than_it_may() {
+        let mut guard = arm();
+        assert_eq!(guard.begin(&[0.5, -0.25]), [0.5, -0.25]);
+        assert_eq!(guard.accept(&[1.0, -0.26]).unwrap(), [0.55, -0.26]);
+        assert_eq!(guard.accept(&[0.56, -0.26]).unwrap(), [0.56, -0.26]);
+    }
+
+    #[test]
+    fn what_is_no_action_of_this_robot_is_not_executed() {
+        let mut guard = arm();
+        guard.begin(&[0.0, 0.0]);
+        assert_eq!(guard.accept(&[0.0]), Err(Refused::Length));
+        assert_eq!(guard.accept(&[f32::NAN, 0.0]), Err(Refused::NotFinite));
+        assert_eq!(guard.accept(&[0.0, 1.8]), Err(Refused::OutOfLimits));
+        // It counts as executed nothing.
+        assert_eq!(guard.accept(&[0.04, 0.0]).unwrap(), [0.04, 0.0]);
+    }
+
+    #[test]
+    fn it_rests_where_the_interface_says() {
+        let mut guard = arm();
+        guard.begin(&[0.0, 0.0]);
+        guard.accept(&[0.05, 0.05]).unwrap();
+        assert_eq!(guard.rest(&[0.03, 0.02]).unwrap(), [0.03, 0.02]);
+        assert!(guard.rest(&[f32::NAN, 0.0]).is_none(), "what is not measured cannot be held");
+        let mut hand = Guard::new(&Interface::metaworld());
+        hand.begin(&[0.0; 18]);
+        hand.accept(&[0.5; 4]).unwrap();
+        assert_eq!(hand.rest(&[0.0; 18]).unwrap(), [0.0; 4]);
+    }
+}
