@@ -8,6 +8,7 @@
 
 mod table;
 
+use rcwm_runtime::policy::Surprise;
 use rcwm_runtime::{EngineSettings, Policy};
 use table::Table;
 
@@ -24,14 +25,14 @@ fn main() -> anyhow::Result<()> {
         executed = Some(robot.step(decision.action));
         // Idle time until the next picture: what needs only the action is computed now.
         policy.work_ahead(executed.as_ref())?;
-        if let Some(surprise) = decision.surprise {
+        if let Some(Surprise::Rcwm { robot, environment }) = decision.surprise {
             let [x, y, z, gripper] = *decision.action else {
                 anyhow::bail!("a bundle of four numbers is needed")
             };
             println!(
                 "step {step:>2}: action {x:>6.3} {y:>6.3} {z:>6.3} {gripper:>6.3}  surprise of the robot {:>6.2} nats, of its \
                  environment {:>6.2}",
-                surprise.robot, surprise.environment
+                robot, environment
             );
         }
     }

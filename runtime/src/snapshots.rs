@@ -51,6 +51,7 @@ struct Gathered {
     telemetry: Telemetry,
     robot: Histogram<u64>,
     environment: Histogram<u64>,
+    dynamics: Histogram<u64>,
 }
 
 #[derive(Serialize)]
@@ -59,8 +60,12 @@ struct Summary {
     ticks: u64,
     rate_hz: f64,
     latency: Vec<Latency>,
+    #[serde(skip_serializing_if = "Option::is_none")]
     robot_surprise: Option<SurpriseStatistics>,
+    #[serde(skip_serializing_if = "Option::is_none")]
     environment_surprise: Option<SurpriseStatistics>,
+    #[serde(skip_serializing_if = "Option::is_none")]
+    dynamics_surprise: Option<SurpriseStatistics>,
 }
 
 #[derive(Serialize)]
@@ -79,7 +84,13 @@ impl Gathered {
     fn new() -> Self {
         let empty =
             Histogram::new_with_bounds(1, MILLINATS_MAX, 3).expect("the bounds are constants that fit");
-        Self { ticks: 0, telemetry: Telemetry::new(), robot: empty.clone(), environment: empty }
+        Self {
+            ticks: 0,
+            telemetry: Telemetry::new(),
+            robot: empty.clone(),
+            environment: empty.clone(),
+            dynamics: empty,
+        }
     }
 
     fn add(&mut self, record: &Record) {
@@ -91,10 +102,15 @@ impl Gathered {
             CallOutcome::Decided { surprise, .. } => surprise,
             _ => None,
         });
-        if let Some(Surprise { robot, environment }) = surprises.next_back() {
-            // Rounding may put a divergence of 0 a little below it.
-            self.robot.saturating_record((robot.max(0.0) * 1e3) as u64);
-            self.environment.saturating_record((environment.max(0.0) * 1e3) as u64);
+        // Rounding may put a divergence of 0 a little below it.
+        let record = |to: &mut Histogram<u64>, nats: f32| to.saturating_record((nats.max(0.0) * 1e3) as u64);
+        match surprises.next_back() {
+            Some(Surprise::Rcwm { robot, environment }) => {
+                record(&mut self.robot, robot);
+                record(&mut self.environment, environment);
+            }
+            Some(Surprise::Dreamer(dynamics)) => record(&mut self.dynamics, dynamics),
+            None => {}
         }
     }
 
@@ -106,6 +122,7 @@ impl Gathered {
             latency: self.telemetry.latencies(),
             robot_surprise: statistics(&self.robot),
             environment_surprise: statistics(&self.environment),
+            dynamics_surprise: statistics(&self.dynamics),
         }
     }
 }

@@ -67,8 +67,8 @@ fn every_optimization_gives_what_the_exported_parts_give() {
             {
                 assert!((found - expected).abs() < 1e-4, "{index}, step {step}: {found} {expected}");
             }
-            assert_eq!(other.state().robot.z, exported.state().robot.z, "{index}, step {step}");
-            assert_eq!(other.state().environment.z, exported.state().environment.z, "{index}, step {step}");
+            assert_eq!(other.state().branches[0].z, exported.state().branches[0].z, "{index}, step {step}");
+            assert_eq!(other.state().branches[1].z, exported.state().branches[1].z, "{index}, step {step}");
             other.set_state(exported.state()).unwrap();
         }
         let state = exported.state().clone();
@@ -196,6 +196,6 @@ fn imagined_frames_agree_with_the_exported_parts() {
         for (found, expected) in found.mean.iter().zip(expected.mean) {
             assert!((found - expected).abs() < 1e-4, "step {step}: {found} {expected}");
         }
-        assert_eq!(compiled.state().robot.z, exported.state().robot.z, "step {step}");
+        assert_eq!(compiled.state().branches[0].z, exported.state().branches[0].z, "step {step}");
     }
 }

@@ -1,6 +1,6 @@
 //! The controller against a real peer on a real link.
 
-use rcwm_models::bundle::PartName;
+use rcwm_models::bundle::BundleKind;
 use rcwm_models::wire::{ActionSource, ObservationFlags};
 use rcwm_runtime::controller::{Ended, Fallback};
 use rcwm_runtime::pacing::PacingSettings;
@@ -76,7 +76,7 @@ fn a_stale_observation_is_dropped_and_a_gap_is_counted() {
 
 #[test]
 fn an_output_that_is_not_finite_never_reaches_the_wire() {
-    for part in PartName::REQUIRED {
+    for part in BundleKind::Rcwm.parts().iter().copied() {
         let bundle = dividing_by_zero(part);
         let link = own_link();
         let peer = link.peer();

@@ -3,9 +3,9 @@
 #![allow(clippy::unwrap_used, reason = "a test that fails panics")]
 
 use rcwm_models::IMAGE_BYTES;
-use rcwm_models::bundle::{Bundle, PartName};
+use rcwm_models::bundle::{Bundle, BundleKind};
 use rcwm_models::wire::ActionValues;
-use rcwm_runtime::policy::Sampling;
+use rcwm_runtime::policy::{Sampling, Surprise};
 use rcwm_runtime::{EngineError, EngineSettings, Policy, PolicyError};
 use rcwm_testkit::{image, smallest_bundle, with_nan_weight};
 
@@ -39,7 +39,7 @@ fn the_executed_action_matters_except_at_the_first_of_an_episode() {
     let moved = policy.state().clone();
     policy.set_state(&start).unwrap();
     policy.observe(&image(1), Some(&[1.0; 4].into())).unwrap();
-    assert_ne!(policy.state().robot.h, moved.robot.h);
+    assert_ne!(policy.state().branches[0].h, moved.branches[0].h);
 }
 
 #[test]
@@ -70,7 +70,7 @@ fn what_is_invalid_is_refused_and_leaves_the_state_alone() {
 /// Its outputs would look sound: tract's sigmoid, tanh and SiLU turn NaN into a bound.
 #[test]
 fn weights_that_are_no_numbers_are_refused_before_they_run() {
-    for part in PartName::REQUIRED {
+    for part in BundleKind::Rcwm.parts().iter().copied() {
         let bundle = with_nan_weight(part);
         let refused = Policy::load(bundle.path(), EngineSettings::tract()).err();
         let Some(PolicyError::Engine(error @ EngineError::Weights { .. })) = refused else {
@@ -107,10 +107,12 @@ fn work_done_ahead_changes_nothing_but_when_it_is_done() {
 fn an_imagined_frame_moves_the_state_and_has_no_surprise() {
     let mut policy = Policy::load(&smallest_bundle(), EngineSettings::tract()).unwrap();
     let seen = policy.observe(&image(0), None).unwrap();
-    assert!(seen.surprise.is_some_and(|surprise| surprise.robot > 0.0 && surprise.environment > 0.0));
+    assert!(
+        matches!(seen.surprise, Some(Surprise::Rcwm { robot, environment }) if robot > 0.0 && environment > 0.0)
+    );
     let before = policy.state().clone();
     let imagined = policy.imagine(&executed_values()).unwrap();
     assert_eq!(imagined.surprise, None);
-    assert_eq!(policy.state().robot.z, policy.buffers().robot.prior_z);
+    assert_eq!(policy.state().branches[0].z, policy.buffers().branches[0].prior_z);
     assert_ne!(*policy.state(), before);
 }

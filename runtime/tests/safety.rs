@@ -10,7 +10,7 @@ use rcwm_models::wire::{ActionSource, ActionValues, ControllerLink, OwnedObserva
 use rcwm_runtime::controller::{
     Controller, ControllerError, ControllerSettings, Ended, Fallback, Tick, TickLimits, TickObserver,
 };
-use rcwm_runtime::policy::Sampling;
+use rcwm_runtime::policy::{Sampling, SurpriseLimits};
 use rcwm_runtime::swap::{self, Answer, SwapSettings, Swapper, When};
 use rcwm_runtime::{EngineKind, EngineSettings, Policy};
 use rcwm_testkit::{
@@ -307,7 +307,13 @@ fn limits_are_last_right_after_a_swap_under_a_rate_limit() {
     let peer = link.peer();
     let policy = Policy::load(&smallest_bundle(), EngineSettings::tract()).unwrap();
     let (engine, interface) = (EngineSettings::tract(), policy.manifest().interface.clone());
-    let server = SwapSettings { link: link.0.clone(), engine, sampling: Sampling::Mode, interface };
+    let server = SwapSettings {
+        link: link.0.clone(),
+        engine,
+        sampling: Sampling::Mode,
+        interface,
+        surprise: SurpriseLimits::default(),
+    };
     let limit = |settings: &mut ControllerSettings| settings.rate_max = Some(0.05);
     let controller = start_changed(policy, &link, limit, move |controller| {
         controller.take_swaps(Swapper::start(server).unwrap());

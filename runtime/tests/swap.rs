@@ -10,12 +10,12 @@ use std::time::Duration;
 use rcwm_models::bundle::PartName;
 use rcwm_models::wire::{ActionSource, ActionValues, ObservationFlags, SimulatorLink};
 use rcwm_runtime::controller::{Controller, ControllerSettings, RunReport, TickLimits};
-use rcwm_runtime::policy::Sampling;
+use rcwm_runtime::policy::{Sampling, SurpriseLimits};
 use rcwm_runtime::swap::{Answer, SwapError, SwapSettings, Swapper, When, ask, name_of_server};
 use rcwm_runtime::{EngineKind, EngineSettings, Policy};
 use rcwm_testkit::{
-    OwnLink, dividing_by_zero, own_link, smallest_bundle, too_small_for_16_bits, with_manifest,
-    with_nan_weight,
+    OwnLink, dividing_by_zero, dreamer_bundle, own_link, smallest_bundle, too_small_for_16_bits,
+    with_manifest, with_nan_weight,
 };
 
 const EPISODE: u64 = 20;
@@ -30,15 +30,27 @@ fn start_on(link: &OwnLink, engine: EngineSettings) -> JoinHandle<RunReport> {
 }
 
 fn start_with_limits(link: &OwnLink, engine: EngineSettings, ticks: TickLimits) -> JoinHandle<RunReport> {
+    start_surprised(link, engine, ticks, SurpriseLimits::default())
+}
+
+fn start_surprised(
+    link: &OwnLink,
+    engine: EngineSettings,
+    ticks: TickLimits,
+    surprise: SurpriseLimits,
+) -> JoinHandle<RunReport> {
     let policy = Policy::load(&smallest_bundle(), engine).unwrap();
     let settings = SwapSettings {
         link: link.0.clone(),
         engine,
         sampling: Sampling::Mode,
         interface: policy.manifest().interface.clone(),
+        surprise,
     };
     let swapper = Swapper::start(settings).unwrap();
-    let change = |settings: &mut ControllerSettings| settings.ticks = ticks;
+    let change = |settings: &mut ControllerSettings| {
+        (settings.ticks, settings.surprise) = (ticks, surprise);
+    };
     rcwm_testkit::start_changed(policy, link, change, move |controller: &mut Controller| {
         controller.take_swaps(swapper);
         let ended = controller.run(&AtomicBool::new(false), &mut []).unwrap();
@@ -135,6 +147,48 @@ fn a_bundle_taken_at_once_starts_from_its_initial_state_in_the_middle_of_an_epis
 }
 
 #[test]
+fn a_policy_of_another_kind_takes_over_and_gives_way_again() {
+    let link = own_link();
+    let peer = link.peer();
+    let controller = start(&link);
+    let mut peer_ticks = Peer { link: &peer, sequence: 0 };
+    for _ in 0..3 {
+        peer_ticks.tick();
+    }
+    for (bundle, steps) in [(dreamer_bundle(), 3..8), (smallest_bundle(), 8..12)] {
+        let answer = ask_aside(&link, &bundle, When::Now).join().unwrap().unwrap();
+        assert!(matches!(answer, Answer::Taken { .. }), "{answer:?}");
+        let mut policy = Policy::load(&bundle, EngineSettings::tract()).unwrap();
+        for step in steps.clone() {
+            let executed = rcwm_testkit::observation(step, step as u32).view().executed_action();
+            let image = rcwm_testkit::image(step as u32);
+            let expected = policy.observe(&image, (step > steps.start).then_some(&executed)).unwrap();
+            assert_eq!(peer_ticks.tick(), expected.action, "step {step}");
+        }
+    }
+    peer.close().unwrap();
+    let report = controller.join().unwrap();
+    assert_eq!(report.counters.swaps, 2);
+    // Each kind's surprises are told apart.
+    let surprise = report.surprise.unwrap();
+    assert!(surprise.robot.is_some() && surprise.environment.is_some() && surprise.dynamics.is_some());
+}
+
+#[test]
+fn a_kind_without_the_surprise_that_the_run_limits_is_refused() {
+    let link = own_link();
+    let peer = link.peer();
+    let surprise = SurpriseLimits { robot_max: Some(1e6), ..SurpriseLimits::default() };
+    let controller = start_surprised(&link, EngineSettings::tract(), TickLimits::default(), surprise);
+    let mut peer_ticks = Peer { link: &peer, sequence: 0 };
+    let refused = peer_ticks.tick_until(ask_aside(&link, &dreamer_bundle(), When::Now)).unwrap();
+    let Answer::Refused { reason } = refused else { panic!("{refused:?}") };
+    assert!(reason.contains("--surprise-robot-max"), "{reason}");
+    peer.close().unwrap();
+    assert_eq!(controller.join().unwrap().counters.swaps, 0);
+}
+
+#[test]
 fn a_policy_that_has_seen_nothing_yet_is_stood_in_for_by_as_many_fallbacks_as_allowed() {
     let link = own_link();
     let peer = link.peer();
@@ -160,8 +214,8 @@ fn a_bad_bundle_is_refused_with_one_line_and_the_old_one_runs_on() {
     let mut peer_ticks = Peer { link: &peer, sequence: 0 };
     let slow = with_manifest(|manifest| manifest.interface.rate_hz = 20.0);
     let damaged = with_manifest(|manifest| manifest.parts[1].sha256.replace_range(..1, "x"));
-    let sizes = with_manifest(|manifest| manifest.model.deter *= 2);
-    let action = with_manifest(|manifest| manifest.model.action = 7);
+    let sizes = with_manifest(|manifest| manifest.model.as_mut().unwrap().deter *= 2);
+    let action = with_manifest(|manifest| manifest.model.as_mut().unwrap().action = 7);
     let golden = rcwm_testkit::with_golden(|mean| mean + 0.01);
     let missing = tempfile::tempdir().unwrap();
     for (bundle, word) in [

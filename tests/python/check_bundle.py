@@ -101,30 +101,33 @@ class Policy:
 
 def replay(policy, golden, initial, errors, recurrent):
     """Runs all ticks. Where `recurrent`, the state is carried over from our own results, else from the golden ones."""
+    branches = [name for name in ("robot", "environment", "dynamics") if name in policy.sessions]
     state = None
     for tick, first in enumerate(golden["input/is_first"]):
         if first:
-            state = [initial[name] for name in ("robot/z", "robot/h", "environment/z", "environment/h")]
-        robot_z, robot_h, environment_z, environment_h = state
+            state = [initial[f"{branch}/{value}"] for branch in branches for value in ("z", "h")]
         row = slice(tick, tick + 1)
         encoder = policy.run("encoder", golden["input/image"][row])
         features = encoder["features"]
         errors.compare("encoder", tick, encoder)
-        action, noise = golden["input/action"][row], golden["input/robot_noise"][tick]
         measured = [golden["input/state"][row]] if "input/state" in golden else []
-        robot = policy.run("robot", robot_z, robot_h, action, features, noise, *measured)
-        errors.compare("robot", tick, robot)
+        acting = branches[0]  # robot or dynamics
+        action, noise = golden["input/action"][row], golden[f"input/{acting}_noise"][tick]
+        first_branch = policy.run(acting, *state[:2], action, features, noise, *measured)
+        errors.compare(acting, tick, first_branch)
         if not recurrent:
-            robot = expected(golden, "robot", tick)
-        interaction = policy.run("interaction", robot["prior_z"], robot["h_next"], environment_z)
-        errors.compare("interaction", tick, interaction)
-        e = interaction["e"] if recurrent else golden["expect/interaction/e"][row]
-        noise = golden["input/environment_noise"][tick]
-        environment = policy.run("environment", e, environment_h, features, noise)
-        errors.compare("environment", tick, environment)
-        if not recurrent:
-            environment = expected(golden, "environment", tick)
-        state = [robot["posterior_z"], robot["h_next"], environment["posterior_z"], environment["h_next"]]
+            first_branch = expected(golden, acting, tick)
+        found = [first_branch]
+        if "environment" in branches:
+            environment_z, environment_h = state[2:]
+            interaction = policy.run("interaction", first_branch["prior_z"], first_branch["h_next"], environment_z)
+            errors.compare("interaction", tick, interaction)
+            e = interaction["e"] if recurrent else golden["expect/interaction/e"][row]
+            noise = golden["input/environment_noise"][tick]
+            environment = policy.run("environment", e, environment_h, features, noise)
+            errors.compare("environment", tick, environment)
+            found.append(environment if recurrent else expected(golden, "environment", tick))
+        state = [branch[value] for branch in found for value in ("posterior_z", "h_next")]
         for part in ("actor", "reward", "continue", "decoder"):
             if part in policy.sessions:
                 errors.compare(part, tick, policy.run(part, *state))

@@ -51,11 +51,18 @@ fn a_recorded_episode_becomes_the_golden_values_that_both_engines_reproduce() {
     assert!(episode.robot_mask.is_some() && episode.proprio.is_some());
     assert!(folder.path().join("episode-0000.gif").metadata().unwrap().len() > 10_000, "a film was written");
 
-    let (checkpoint, bundle) = (folder.path().join("checkpoint"), folder.path().join("bundle"));
+    for model in ["rcwm", "vanilla"] {
+        check_model(model, &recorded, &folder.path().join(model));
+    }
+}
+
+/// An untrained model of this kind, exported with golden values of the recorded episode.
+fn check_model(model: &str, recorded: &Path, folder: &Path) {
+    let (checkpoint, bundle) = (folder.join("checkpoint"), folder.join("bundle"));
     let (checkpoint, bundle) = (checkpoint.to_str().unwrap(), bundle.to_str().unwrap());
-    succeed(trainer(&["init", "--preset", "debug", "--model", "rcwm", "--seed", "5", "--out", checkpoint]));
+    succeed(trainer(&["init", "--preset", "debug", "--model", model, "--seed", "5", "--out", checkpoint]));
     let mut export = trainer(&["export", "--checkpoint", checkpoint, "--out", bundle, "--task", "door-open"]);
-    export.args(["--golden-ticks", "250", "--golden-episode"]).arg(&recorded);
+    export.args(["--golden-ticks", "250", "--golden-episode"]).arg(recorded);
     succeed(export);
     let opened = Bundle::open(Path::new(bundle)).unwrap();
     assert_eq!(opened.golden.u8("input/image").unwrap().shape()[0], 250);
@@ -66,7 +73,7 @@ fn a_recorded_episode_becomes_the_golden_values_that_both_engines_reproduce() {
     succeed(check);
 
     // tract and ONNX Runtime from Rust: every part, and 250 recurrent ticks.
-    let json = folder.path().join("verify.json");
+    let json = folder.join("verify.json");
     let mut verify = Command::new(binary("rcwm-runtime"));
     verify.args(["verify", "--engine", "all", "--bundle", bundle, "--json"]).arg(&json);
     succeed(verify);

@@ -10,7 +10,7 @@ use std::sync::atomic::{AtomicUsize, Ordering};
 
 use assert_cmd::Command;
 use ndarray::{Array2, Array4};
-use rcwm_models::bundle::{Bundle, MANIFEST_FILE, PartName};
+use rcwm_models::bundle::{Bundle, BundleKind, MANIFEST_FILE, PartName, WriteError};
 use rcwm_models::episode::Episode;
 use rcwm_models::interface::Interface;
 use rcwm_models::onnx;
@@ -43,7 +43,7 @@ fn options() -> Options {
     Options {
         task: "reach".into(),
         interface: Interface::metaworld(),
-        parts: PartName::ALL.to_vec(),
+        parts: BundleKind::Rcwm.all_parts().collect(),
         golden_episode: None,
         golden_ticks: 6,
         golden_seed: 1,
@@ -68,9 +68,9 @@ fn a_bundle_opens_with_every_part_golden_values_and_the_initial_state() {
     let bundle = Bundle::open(&place).unwrap();
     assert_eq!(bundle.parts.len(), 8);
     assert_eq!((bundle.manifest.task.as_str(), bundle.manifest.provenance.updates), ("reach", 0));
-    assert!(bundle.initial.robot_h.iter().any(|x| *x != 0.0));
-    let model = &bundle.manifest.model;
-    for name in PartName::ALL {
+    assert!(bundle.initial.branches[0].h.iter().any(|x| *x != 0.0));
+    let model = bundle.manifest.model.as_ref().unwrap();
+    for name in BundleKind::Rcwm.all_parts() {
         for output in name.signature(model).1 {
             let golden = bundle.golden.get(&format!("expect/{name}/{}", output.name)).unwrap();
             assert_eq!(golden.shape()[1..], output.shape[1..], "{name}/{}", output.name);
@@ -87,7 +87,7 @@ fn a_bundle_opens_with_every_part_golden_values_and_the_initial_state() {
 fn the_required_parts_alone_are_a_bundle_without_the_others_golden_values() {
     let folder = tempfile::tempdir().unwrap();
     let place = folder.path().join("bundle");
-    let options = Options { parts: PartName::REQUIRED.to_vec(), ..options() };
+    let options = Options { parts: BundleKind::Rcwm.parts().to_vec(), ..options() };
     let bundle = export(&support::reference_checkpoint(), &place, &options).unwrap();
     assert_eq!(bundle.parts.len(), 5);
     assert!(bundle.golden.0.keys().all(|name| !name.contains("decoder") && !name.contains("reward")));
@@ -130,7 +130,10 @@ fn a_bundle_is_replaced_only_on_demand_and_a_folder_that_is_none_never() {
     let place = folder.path().join("bundle");
     let checkpoint = support::untrained(ModelKind::Rcwm, 1);
     let old = export(&checkpoint, &place, &options()).unwrap();
-    assert!(matches!(export(&checkpoint, &place, &options()), Err(ExportError::Exists { .. })));
+    assert!(matches!(
+        export(&checkpoint, &place, &options()),
+        Err(ExportError::Write(WriteError::Exists { .. }))
+    ));
     let replacing = Options { replace: true, ..options() };
     let new = export(&support::untrained(ModelKind::Rcwm, 2), &place, &replacing).unwrap();
     assert_ne!(old.manifest.parts, new.manifest.parts);
@@ -139,7 +142,10 @@ fn a_bundle_is_replaced_only_on_demand_and_a_folder_that_is_none_never() {
     let other = folder.path().join("notes");
     fs::create_dir(&other).unwrap();
     fs::write(other.join("notes.txt"), "keep").unwrap();
-    assert!(matches!(export(&checkpoint, &other, &replacing), Err(ExportError::NotABundle { .. })));
+    assert!(matches!(
+        export(&checkpoint, &other, &replacing),
+        Err(ExportError::Write(WriteError::NotABundle { .. }))
+    ));
     assert!(other.join("notes.txt").exists());
 }
 
@@ -165,38 +171,54 @@ fn two_cameras() -> Interface {
 }
 
 /// ONNX Runtime and the official checker, which share no code with this project, on every part and on the recurrent policy.
-#[test]
-fn exported_graphs_of_two_large_cameras_and_a_measured_state_give_the_models_numbers() {
-    let folder = tempfile::tempdir().unwrap();
-    let place = folder.path().join("bundle");
-    let debug = ModelSettings::preset(Preset::Debug, ModelKind::Rcwm);
-    let model = ModelSettings { action: 7, image_side: 128, cameras: 2, state: 14, ..debug };
-    let checkpoint = support::checkpoint(support::lively_parameters(&model), model.clone());
-    let options = Options { interface: two_cameras(), ..options() };
-    let bundle = export(&checkpoint, &place, &options).unwrap();
-    let shape = |input: &str| bundle.golden.get(input).unwrap().shape().to_vec();
-    assert_eq!(shape("input/image"), [6, 128, 128, 6]);
-    assert_eq!((shape("input/action"), shape("input/state")), (vec![6, 7], vec![6, 14]));
-    assert_eq!(shape("expect/decoder/robot_mask")[1..], [128, 128, 2]);
-    let (inputs, _) = PartName::Robot.signature(&model);
-    assert_eq!((inputs[5].name.as_str(), inputs[5].shape.as_slice()), ("state", &[1, 14][..]));
-    assert_eq!(bundle.manifest.policy.inputs, ["front", "wrist", "joint_pos", "joint_vel"]);
-
+fn check_with_python(bundle: &Path) {
     let root = Path::new(env!("CARGO_MANIFEST_DIR")).join("..");
     let mut check = Command::new(root.join(".venv/bin/python"));
-    check.arg(root.join("tests/python/check_bundle.py")).arg(&place);
+    check.arg(root.join("tests/python/check_bundle.py")).arg(bundle);
     let said = check.assert().success();
     let said = String::from_utf8_lossy(&said.get_output().stdout).into_owned();
     assert!(said.contains("all parts within 1e-05 over 6 ticks"), "{said}");
 }
 
 #[test]
-fn a_vanilla_model_is_refused() {
+fn exported_graphs_of_two_large_cameras_and_a_measured_state_give_the_models_numbers() {
+    for (kind, acting, mask) in
+        [(ModelKind::Rcwm, PartName::Robot, "robot_mask"), (ModelKind::Vanilla, PartName::Dynamics, "mask")]
+    {
+        let folder = tempfile::tempdir().unwrap();
+        let place = folder.path().join("bundle");
+        let debug = ModelSettings::preset(Preset::Debug, kind);
+        let model = ModelSettings { action: 7, image_side: 128, cameras: 2, state: 14, ..debug };
+        let checkpoint = support::checkpoint(support::lively_parameters(&model), model.clone());
+        let parts = BundleKind::of(kind).all_parts().collect();
+        let options = Options { interface: two_cameras(), parts, ..options() };
+        let bundle = export(&checkpoint, &place, &options).unwrap();
+        let shape = |input: &str| bundle.golden.get(input).unwrap().shape().to_vec();
+        assert_eq!(shape("input/image"), [6, 128, 128, 6]);
+        assert_eq!((shape("input/action"), shape("input/state")), (vec![6, 7], vec![6, 14]));
+        assert_eq!(shape(&format!("expect/decoder/{mask}"))[1..], [128, 128, 2]);
+        let (inputs, _) = acting.signature(&model);
+        assert_eq!((inputs[5].name.as_str(), inputs[5].shape.as_slice()), ("state", &[1, 14][..]));
+        assert_eq!(bundle.manifest.policy.inputs, ["front", "wrist", "joint_pos", "joint_vel"]);
+        check_with_python(&place);
+    }
+}
+
+#[test]
+fn a_vanilla_model_becomes_a_bundle_of_one_branch() {
     let folder = tempfile::tempdir().unwrap();
-    let result =
-        export(&support::untrained(ModelKind::Vanilla, 1), &folder.path().join("bundle"), &options());
-    assert!(matches!(result, Err(ExportError::Vanilla)));
+    let place = folder.path().join("bundle");
+    let vanilla = support::untrained(ModelKind::Vanilla, 1);
+    // The parts of two branches are another kind's.
+    let error = export(&vanilla, &place, &options()).unwrap_err().to_string();
+    assert!(error.contains("part robot is not one of kind dreamer"), "{error}");
     assert_eq!(entries(folder.path()), 0);
+    let options = Options { parts: BundleKind::Dreamer.all_parts().collect(), ..options() };
+    let bundle = export(&vanilla, &place, &options).unwrap();
+    assert_eq!(bundle.manifest.kind, BundleKind::Dreamer);
+    let names: Vec<&str> = bundle.manifest.parts.iter().map(|part| part.name.as_str()).collect();
+    assert_eq!(names, ["encoder", "dynamics", "actor", "reward", "continue", "decoder"]);
+    assert_eq!(bundle.initial.branches.len(), 1);
 }
 
 #[test]

@@ -1,7 +1,8 @@
 //! Whether a robot fits a bundle, and a bundle its own interface.
 
 use super::{BundleError, Limits, Manifest};
-use crate::interface::{Action, Interface, Mismatch, mismatches};
+use crate::interface::{Action, Camera, Interface, Mismatch, mismatches};
+use crate::settings::ModelSettings;
 
 impl Manifest {
     /// Everything in which a robot differs from what this bundle needs; empty where it fits.
@@ -23,28 +24,57 @@ impl Manifest {
         self.policy.limits.clone().unwrap_or_else(widest)
     }
 
-    /// The sizes of what the policy reads must be those of the model.
+    /// The cameras that the policy sees, in its order.
+    pub fn cameras(&self) -> impl Iterator<Item = &Camera> {
+        let of = |name: &String| self.interface.camera.iter().find(move |camera| camera.name == *name);
+        self.policy.inputs.iter().filter_map(of)
+    }
+
+    /// How many measured numbers the policy reads.
+    #[must_use]
+    pub fn measured_numbers(&self) -> usize {
+        let is_camera = |name: &&String| self.interface.camera.iter().any(|camera| camera.name == **name);
+        let states = self.policy.inputs.iter().filter(|name| !is_camera(name));
+        states.filter_map(|name| self.interface.state_range(name)).map(|range| range.len()).sum()
+    }
+
+    /// Bytes of the pictures that the policy sees.
+    #[must_use]
+    pub fn image_bytes(&self) -> usize {
+        self.cameras().map(|camera| camera.shape.iter().product::<usize>()).sum()
+    }
+
+    /// What the policy reads must be there.
     pub(super) fn check_inputs(&self) -> Result<(), BundleError> {
-        let (model, mut cameras, mut numbers) = (&self.model, 0, 0);
-        for name in &self.policy.inputs {
-            if let Some(camera) = self.interface.camera.iter().find(|camera| camera.name == *name) {
-                cameras += 1;
-                let needed = [model.image_side, model.image_side, 3];
-                if camera.shape != needed {
-                    return Err(BundleError::Invalid(format!(
-                        "camera {name} is {:?}, the model sees {needed:?}",
-                        camera.shape
-                    )));
-                }
-            } else if let Some(range) = self.interface.state_range(name) {
-                numbers += range.len();
-            } else {
-                return Err(BundleError::Invalid(format!(
-                    "policy.inputs: {name:?} is no camera or state of the interface"
-                )));
-            }
+        let is_known = |name: &&String| {
+            self.interface.camera.iter().any(|camera| camera.name == **name)
+                || self.interface.state_range(name).is_some()
+        };
+        match self.policy.inputs.iter().find(|name| !is_known(name)) {
+            None => Ok(()),
+            Some(name) => Err(BundleError::Invalid(format!(
+                "policy.inputs: {name:?} is no camera or state of the interface"
+            ))),
         }
-        let (needed, found) = ((model.cameras, model.state), (cameras, numbers));
+    }
+
+    /// The sizes of what the policy reads and gives must be those of the model.
+    pub(super) fn check_sizes(&self, model: &ModelSettings) -> Result<(), BundleError> {
+        let (numbers, expected) = (self.interface.action_numbers(), model.action);
+        if numbers != expected {
+            return Err(BundleError::Invalid(format!(
+                "the interface has {numbers} numbers of actions, model.action = {expected}"
+            )));
+        }
+        let needed = [model.image_side, model.image_side, 3];
+        if let Some(camera) = self.cameras().find(|camera| camera.shape != needed) {
+            let Camera { name, shape, .. } = camera;
+            return Err(BundleError::Invalid(format!(
+                "camera {name} is {shape:?}, the model sees {needed:?}"
+            )));
+        }
+        let (needed, found) =
+            ((model.cameras, model.state), (self.cameras().count(), self.measured_numbers()));
         if needed != found {
             return Err(BundleError::Invalid(format!(
                 "policy.inputs name {} cameras and states of {} numbers, the model reads {} and {}",

@@ -5,105 +5,22 @@ use std::path::{Component, Path, PathBuf};
 
 use prost::Message;
 
-use super::graph::{self, GraphError};
-use super::manifest::{FORMAT, FileEntry, Manifest, PartEntry, PartName, TensorSpec};
+use super::error::BundleError;
+use super::graph;
+use super::initial::{InitialState, read_initial};
+use super::kind::PartName;
+use super::manifest::{FORMAT, FileEntry, Manifest, PartEntry};
+use super::recurrent::PolicySignature;
+use super::spec::{DType, TensorSpec};
 use super::version1::ManifestV1;
-use super::{DType, GOLDEN_BYTES_MAX, MANIFEST_BYTES_MAX, MANIFEST_FILE, PART_BYTES_MAX, PARTS_BYTES_MAX};
-use crate::files::{FileError, read_capped, sha256_hex};
+use super::{GOLDEN_BYTES_MAX, MANIFEST_BYTES_MAX, MANIFEST_FILE, PART_BYTES_MAX, PARTS_BYTES_MAX};
+use crate::files::{read_capped, sha256_hex};
 use crate::onnx::{self, OnnxError};
-use crate::settings::{ModelKind, SettingsError};
-use crate::tensors::{Tensors, TensorsError};
+use crate::settings::ModelKind;
+use crate::tensors::Tensors;
 
 /// Largest file of initial states accepted, in bytes.
 const INITIAL_BYTES_MAX: u64 = 1 << 20;
-
-/// Why a bundle was refused.
-#[derive(Debug, thiserror::Error)]
-pub enum BundleError {
-    /// A file is missing, unreadable, too large or a link.
-    #[error("bundle: {0}")]
-    File(#[from] FileError),
-    /// The manifest is not TOML of the expected form.
-    #[error("bundle: {path}: {reason}")]
-    Manifest {
-        /// The manifest.
-        path: PathBuf,
-        reason: String,
-    },
-    /// The bundle was written for another version.
-    #[error(
-        "bundle: format {found}, this program reads formats 1 and {FORMAT}; export it again with the matching trainer"
-    )]
-    Format {
-        /// The format found.
-        found: u32,
-    },
-    /// The sizes do not fit together.
-    #[error("bundle: {0}")]
-    Settings(#[from] SettingsError),
-    /// A file name points out of the folder.
-    #[error("bundle: file name {name:?} is not a plain name inside the bundle")]
-    OutsidePath { name: String },
-    /// A file is not the one that was exported.
-    #[error(
-        "bundle: {file}: {what} is {found}, the manifest says {expected}; copy or export the bundle again"
-    )]
-    Mismatch {
-        file: String,
-        /// `size` or `sha256`.
-        what: &'static str,
-        found: String,
-        /// What it must be.
-        expected: String,
-    },
-    /// A part that every policy needs is not listed, or one is listed twice.
-    #[error("bundle: part {part} is {problem}")]
-    Part {
-        part: PartName,
-        /// `missing` or `listed twice`.
-        problem: &'static str,
-    },
-    /// A part is not the ONNX this runtime runs.
-    #[error("bundle: {part}: {source}")]
-    Onnx { part: PartName, source: OnnxError },
-    /// A part's graph does something that it must not.
-    #[error("bundle: {part}: {source}; export it again with the matching trainer")]
-    Graph {
-        part: PartName,
-        /// What it does.
-        source: GraphError,
-    },
-    /// A part's inputs or outputs are not those of the contract.
-    #[error("bundle: {part}: {role} are {found}, expected {expected}")]
-    Signature {
-        part: PartName,
-        /// `inputs` or `outputs`, of the manifest or of the graph.
-        role: &'static str,
-        /// What was found.
-        found: String,
-        /// What the contract says.
-        expected: String,
-    },
-    /// Initial states or golden values are unusable.
-    #[error("bundle: {file}: {source}")]
-    Tensors { file: String, source: TensorsError },
-    /// A value is out of its range.
-    #[error("bundle: {0}")]
-    Invalid(String),
-}
-
-/// The state every episode starts from: `h_0 = tanh(w)`, `z_0` = mode of the prior at `h_0`, per branch.
-#[derive(Debug, Clone, PartialEq)]
-pub struct InitialState {
-    /// Robot: h, d long.
-    pub robot_h: Vec<f32>,
-    /// Robot: z, n class indices.
-    pub robot_z: Vec<i64>,
-    /// Environment: h, d long.
-    pub environment_h: Vec<f32>,
-    /// Environment: z, n class indices.
-    pub environment_z: Vec<i64>,
-}
 
 /// A bundle whose every file was checked and is in memory, so that what was checked is what runs.
 #[derive(Debug, Clone)]
@@ -128,7 +45,7 @@ impl Bundle {
         let mut parts = BTreeMap::new();
         for entry in &manifest.parts {
             let bytes = read_entry(folder, &entry.file_entry(), PART_BYTES_MAX)?;
-            let model = check_graph(entry, bytes, manifest.model.classes)?;
+            let model = check_graph(entry, bytes, manifest.model.as_ref().map_or(0, |model| model.classes))?;
             parts.insert(entry.name, model.encode_to_vec());
         }
         let initial = read_tensors(folder, &manifest.initial, INITIAL_BYTES_MAX)
@@ -186,22 +103,17 @@ fn said_of(error: &toml::de::Error, text: &str) -> String {
 impl Manifest {
     /// Checks everything that can be checked without reading another file.
     pub fn check(&self) -> Result<(), BundleError> {
-        self.model.validate()?;
-        if self.model.kind != ModelKind::Rcwm {
-            return Err(BundleError::Invalid("model.kind: only rcwm bundles can be deployed so far".into()));
-        }
+        self.check_kind()?;
         self.interface.check().map_err(|error| BundleError::Invalid(error.to_string()))?;
-        let (numbers, model) = (self.interface.action_numbers(), self.model.action);
-        if numbers != model {
-            return Err(BundleError::Invalid(format!(
-                "the interface has {numbers} numbers of actions, model.action = {model}"
-            )));
-        }
         self.check_limits()?;
         self.check_inputs()?;
-        for part in PartName::REQUIRED {
-            if !self.parts.iter().any(|entry| entry.name == part) {
-                return Err(BundleError::Part { part, problem: "missing" });
+        if let Some(model) = &self.model {
+            model.validate()?;
+            self.check_sizes(model)?;
+        }
+        for part in self.kind.parts() {
+            if self.part(*part).is_none() {
+                return Err(BundleError::Part { part: *part, problem: "missing" });
             }
         }
         let bytes = self.parts.iter().fold(0_u64, |sum, entry| sum.saturating_add(entry.bytes));
@@ -214,11 +126,37 @@ impl Manifest {
             if self.parts[..index].iter().any(|before| before.name == entry.name) {
                 return Err(BundleError::Part { part: entry.name, problem: "listed twice" });
             }
-            let (inputs, outputs) = entry.name.signature(&self.model);
+            if !self.kind.all_parts().any(|part| part == entry.name) {
+                return Err(BundleError::OtherKind { part: entry.name, kind: self.kind });
+            }
+            let Some(model) = &self.model else {
+                PolicySignature::of(self, entry)?;
+                continue;
+            };
+            let (inputs, outputs) = entry.name.signature(model);
             expect_specs(entry.name, "the manifest's inputs", &entry.inputs, &inputs)?;
             expect_specs(entry.name, "the manifest's outputs", &entry.outputs, &outputs)?;
         }
         Ok(())
+    }
+
+    /// Kind and model go together.
+    fn check_kind(&self) -> Result<(), BundleError> {
+        let (found, expected) = (self.model.as_ref().map(|model| model.kind), self.kind.model());
+        if found == expected {
+            return Ok(());
+        }
+        let said = |kind: Option<ModelKind>| match kind {
+            None => "no [model]",
+            Some(ModelKind::Rcwm) => "model.kind = \"rcwm\"",
+            Some(ModelKind::Vanilla) => "model.kind = \"vanilla\"",
+        };
+        Err(BundleError::Invalid(format!(
+            "kind = \"{}\" with {}, expected {}",
+            self.kind,
+            said(found),
+            said(expected)
+        )))
     }
 }
 
@@ -284,63 +222,9 @@ fn check_graph(entry: &PartEntry, bytes: Vec<u8>, classes: usize) -> Result<onnx
     Ok(model)
 }
 
-impl DType {
-    /// The ONNX number of this type.
-    #[must_use]
-    pub const fn to_onnx(self) -> i32 {
-        match self {
-            Self::U8 => onnx::data_type::UINT8,
-            Self::I64 => onnx::data_type::INT64,
-            Self::F32 => onnx::data_type::FLOAT,
-        }
-    }
-
-    /// The type of an ONNX number, if it is one that crosses a part's border.
-    #[must_use]
-    pub const fn from_onnx(number: i32) -> Option<Self> {
-        match number {
-            onnx::data_type::UINT8 => Some(Self::U8),
-            onnx::data_type::INT64 => Some(Self::I64),
-            onnx::data_type::FLOAT => Some(Self::F32),
-            _ => None,
-        }
-    }
-}
-
 fn read_tensors(folder: &Path, entry: &FileEntry, bytes_max: u64) -> Result<Tensors, BundleError> {
     let bytes = read_entry(folder, entry, bytes_max)?;
     Tensors::of_few(&bytes).map_err(|source| BundleError::Tensors { file: entry.file.clone(), source })
-}
-
-fn read_initial(manifest: &Manifest, tensors: &Tensors) -> Result<InitialState, BundleError> {
-    let model = &manifest.model;
-    let file = &manifest.initial.file;
-    let wrong = |source| BundleError::Tensors { file: file.clone(), source };
-    let h = |name: &str| -> Result<Vec<f32>, BundleError> {
-        let array = tensors.f32(name).map_err(wrong)?;
-        if array.shape() != [1, model.deter] || array.iter().any(|x| !x.is_finite()) {
-            let found = format!("{:?}", array.shape());
-            let expected = format!("finite, [1, {}]", model.deter);
-            return Err(wrong(TensorsError::Unexpected { name: name.to_owned(), found, expected }));
-        }
-        Ok(array.iter().copied().collect())
-    };
-    let z = |name: &str| -> Result<Vec<i64>, BundleError> {
-        let array = tensors.i64(name).map_err(wrong)?;
-        let classes = 0..model.classes as i64;
-        if array.shape() != [1, model.categoricals] || array.iter().any(|class| !classes.contains(class)) {
-            let found = format!("{:?}", array.shape());
-            let expected = format!("[1, {}] of classes 0 to {}", model.categoricals, model.classes - 1);
-            return Err(wrong(TensorsError::Unexpected { name: name.to_owned(), found, expected }));
-        }
-        Ok(array.iter().copied().collect())
-    };
-    Ok(InitialState {
-        robot_h: h("robot/h")?,
-        robot_z: z("robot/z")?,
-        environment_h: h("environment/h")?,
-        environment_z: z("environment/z")?,
-    })
 }
 
 #[cfg(test)]

@@ -3,7 +3,8 @@
 //! ```text
 //! manifest.toml        what follows, with sizes and checksums
 //! encoder.onnx ...     one self-contained ONNX file a part
-//! initial.safetensors  the learned initial state of each branch: `robot/h` [1, d] f32, `robot/z` [1, n] i64, `environment/...`
+//! initial.safetensors  the state every episode starts from: of each branch `robot/h` [1, d] f32, `robot/z` [1, n] i64; of a policy
+//!                      without a world model each `state.NAME`
 //! golden.safetensors   ticks of inputs and the outputs the trainer computed for them
 //! ```
 //!
@@ -12,24 +13,34 @@
 //! [K, 2, n, m] (first the prior's, then the posterior's), and `input/state` f32 [K, state] (as measured) where the model looks at it. Outputs: `expect/<part>/<output>` with the shapes of
 //! [`PartName::signature`], their leading 1 replaced by the number of ticks. Large ones (`features`, images) may cover
 //! only the first ticks. The state that enters tick t is the initial one where `is_first`, else the posterior of
-//! tick t-1.
+//! tick t-1. Kind `recurrent` has `input/CAMERA` u8 [K, H, W, 3] of each camera in place of `input/image`, and no noise; what was
+//! carried into tick t is the expected `next_state.NAME` of tick t-1.
 //!
 //! A bundle comes from outside: nothing in it is believed before [`Bundle::open`] has checked version, sizes, names, paths and
 //! checksums, and that no ONNX file refers to data outside itself.
 
+mod error;
 mod fits;
 mod graph;
+mod initial;
+mod kind;
 mod load;
 mod manifest;
+mod recurrent;
+mod spec;
 mod version1;
+mod write;
 
 pub use crate::interface::ActionMode;
+pub use error::BundleError;
 pub use graph::GraphError;
-pub use load::{Bundle, BundleError, InitialState};
-pub use manifest::{
-    BundleKind, DType, FORMAT, FileEntry, Limits, Manifest, PartEntry, PartName, PolicyInputs, Provenance,
-    TensorSpec,
-};
+pub use initial::{InitialBranch, InitialState};
+pub use kind::{BundleKind, PartName};
+pub use load::Bundle;
+pub use manifest::{FORMAT, FileEntry, Limits, Manifest, PartEntry, PolicyInputs, Provenance};
+pub use recurrent::{CARRIED, CARRIED_NEXT, EXECUTED, Pixels, PolicyInput, PolicyOutput, PolicySignature};
+pub use spec::{DType, TensorSpec};
+pub use write::{NewBundle, WriteError};
 
 /// File name of the manifest.
 pub const MANIFEST_FILE: &str = "manifest.toml";

@@ -2,7 +2,8 @@
 
 use serde::Deserialize;
 
-use super::manifest::{BundleKind, FORMAT, FileEntry, Limits, Manifest, PartEntry, PolicyInputs, Provenance};
+use super::BundleKind;
+use super::manifest::{FORMAT, FileEntry, Limits, Manifest, PartEntry, PolicyInputs, Provenance};
 use crate::interface::{ActionMode, Fallback, FallbackRule, Interface};
 use crate::settings::ModelSettings;
 
@@ -49,7 +50,7 @@ impl From<ManifestV1> for Manifest {
             format: FORMAT,
             kind: BundleKind::Rcwm,
             task: old.task,
-            model: old.model,
+            model: Some(old.model),
             interface,
             policy: PolicyInputs { inputs, limits },
             provenance: old.provenance,

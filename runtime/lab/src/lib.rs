@@ -5,12 +5,14 @@
 //! | [`mod@log`] | a logged run again, bit for bit; its times; its episodes |
 //! | [`film`] | films and strips of a logged run |
 //! | [`plot`] | latency by percentile as a picture |
+//! | [`bundle`] | a bundle of any library's ONNX policy |
 //! | [`inspect`] | what a bundle holds and what a tick costs |
 //! | [`mod@bench`] | the tick's latency on this machine, engines interleaved |
 //!
 //! This crate never links candle or Python.
 
 pub mod bench;
+pub mod bundle;
 pub mod cli;
 pub mod film;
 pub mod inspect;

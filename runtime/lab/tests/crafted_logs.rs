@@ -136,7 +136,7 @@ fn a_state_of_classes_that_do_not_exist_is_a_difference() {
     let loaded = Policy::load(&bundle(), EngineSettings::tract()).unwrap();
     let spoilt = |z: Option<i64>, h: Option<f32>| {
         let (mut state, _) = state_of(&loaded);
-        let BranchState { z: classes, h: values } = &mut state.environment;
+        let BranchState { z: classes, h: values } = &mut state.branches[1];
         z.into_iter().for_each(|z| classes[0] = z);
         h.into_iter().for_each(|h| values[0] = h);
         WholeState::of(&state, u128::MAX)

@@ -69,7 +69,7 @@ Examples:
   rcwm-runtime run --bundle models/bundles/hammer --instance demo --record runs/demo
   rcwm-runtime swap --instance demo --bundle models/bundles/hammer --now
 
-What is looked at afterwards is rcwm-lab's: inspect, bench, replay, telemetry, film, plot. Named here they are passed on.
+What is looked at afterwards is rcwm-lab's: inspect, bundle, bench, replay, telemetry, film, plot. Named here they are passed on.
 
 Exit codes:
   0 done (also after Ctrl-C), 1 error or not verified, 2 usage, 3 no observation within --timeout, 4 stopped: the policy

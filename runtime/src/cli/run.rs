@@ -157,7 +157,9 @@ impl RunArguments {
         sampling: Sampling,
     ) -> Result<Swapper, String> {
         let (link, interface) = (LinkSettings::new(&self.instance), bundle.manifest.interface.clone());
-        Swapper::start(SwapSettings { link, engine, sampling, interface }).map_err(|error| error.to_string())
+        let surprise = self.controller_settings().surprise;
+        Swapper::start(SwapSettings { link, engine, sampling, interface, surprise })
+            .map_err(|error| error.to_string())
     }
 
     fn controller_settings(&self) -> ControllerSettings {

@@ -24,7 +24,8 @@ pub(super) struct SafetyArguments {
         value_parser = |text: &str| text.parse::<Fallback>()
     )]
     fallback: Fallback,
-    /// Missing observations in a row that the world model imagines before the fallback (real time)
+    /// Missing observations in a row that the world model imagines before the fallback; a policy without one holds the last
+    /// action for as many (real time)
     #[arg(long, value_name = "N", default_value_t = TickLimits::default().imagined_ticks_max)]
     imagined_ticks_max: u32,
     /// Fallback actions in a row; then silence where nobody is there, and the end of the run where the policy gives nothing valid
@@ -45,6 +46,9 @@ pub(super) struct SafetyArguments {
     /// The same for the environment branch ("the scene has changed")
     #[arg(long, value_name = "NATS", value_parser = at_least_zero)]
     surprise_environment_max: Option<f32>,
+    /// The same for a world model of one branch (bundles of kind dreamer)
+    #[arg(long, value_name = "NATS", value_parser = at_least_zero)]
+    surprise_dynamics_max: Option<f32>,
     /// Largest change of any number of the action from what was executed last, as a share of half of its range in the interface; beside
     /// the interface's own rate_max
     #[arg(long, value_name = "SHARE", value_parser = at_least_zero)]
@@ -112,6 +116,7 @@ impl SafetyArguments {
             surprise: SurpriseLimits {
                 robot_max: self.surprise_robot_max,
                 environment_max: self.surprise_environment_max,
+                dynamics_max: self.surprise_dynamics_max,
             },
             rate_max: self.rate_limit,
             ..ControllerSettings::new(LinkSettings { spin, ..LinkSettings::new(instance) })

@@ -48,7 +48,10 @@ impl EngineChoice {
 /// Opens and checks a bundle; what stands in its place is said.
 pub fn open_bundle(folder: &Path) -> anyhow::Result<Bundle> {
     if folder.is_file() {
-        anyhow::bail!("{} is a file; expected the folder of a bundle, with manifest.toml", folder.display());
+        anyhow::bail!(
+            "{} is a file; expected the folder of a bundle, with manifest.toml; `rcwm-lab bundle` makes one of an ONNX file",
+            folder.display()
+        );
     }
     let checkpoint = ["", "checkpoints/last"].map(|place| folder.join(place).join("checkpoint.toml"));
     if !folder.join("manifest.toml").exists() && checkpoint.iter().any(|file| file.is_file()) {

@@ -3,7 +3,7 @@
 use std::collections::BTreeSet;
 
 use prost::Message;
-use rcwm_models::bundle::{Bundle, PartName};
+use rcwm_models::bundle::{Bundle, CARRIED, EXECUTED, PartName};
 use rcwm_models::onnx::{self, Model};
 use tract_onnx::prelude::{Framework, TractResult};
 use tract_onnx::tract_hir::internal::{Factoid, InferenceModelExt};
@@ -15,7 +15,9 @@ use crate::operators::DOMAIN;
 /// Reads the parts, names their values `part/name`, and connects what goes out of one with what goes into another.
 pub(super) fn join(bundle: &Bundle) -> Result<Graph, CompileError> {
     let mut graph = Graph::default();
-    for part in PartName::REQUIRED {
+    let mut late: BTreeSet<String> = [inputs::IMAGE, inputs::STATE].map(str::to_owned).into();
+    let kind = bundle.manifest.kind;
+    for part in kind.parts().iter().copied() {
         let refuse = |reason: String| CompileError::Part { part, reason };
         let bytes = bundle.part(part).ok_or_else(|| refuse("the bundle does not have it".into()))?;
         let model = onnx::parse_self_contained(bytes).map_err(|error| refuse(error.to_string()))?;
@@ -23,15 +25,23 @@ pub(super) fn join(bundle: &Bundle) -> Result<Graph, CompileError> {
             facts(bytes).map_err(|error| refuse(rcwm_models::errors::on_one_line(&format!("{error:#}"))))?;
         add(&mut graph, part, model, facts);
     }
-    for (part, names) in [
-        (PartName::Robot, OF_A_BRANCH.as_slice()),
-        (PartName::Environment, &OF_A_BRANCH),
-        (PartName::Interaction, &["e", "attention"]),
-        (PartName::Actor, &["mean", "std"]),
-    ] {
+    for part in kind.parts() {
+        let names: &[&str] = match part {
+            PartName::Interaction => &["e", "attention"],
+            PartName::Actor => &["mean", "std"],
+            branch if kind.branches().contains(branch) => &OF_A_BRANCH,
+            _ => &[],
+        };
         graph.outputs.extend(names.iter().map(|name| format!("{part}/{name}")));
     }
-    mark_late(&mut graph);
+    // A policy in one graph gives what its own entry says.
+    if let Some(policy) = bundle.manifest.part(PartName::Policy) {
+        graph.outputs.extend(policy.outputs.iter().map(|output| format!("{}/{}", policy.name, output.name)));
+        let known_before = |name: &str| name == EXECUTED || name.starts_with(CARRIED);
+        let names = policy.inputs.iter().map(|input| input.name.clone());
+        late.extend(names.filter(|name| !known_before(name)));
+    }
+    mark_late(&mut graph, late);
     Ok(graph)
 }
 
@@ -39,25 +49,24 @@ const OF_A_BRANCH: [&str; 5] = ["h_next", "prior_z", "posterior_z", "prior_log_p
 
 /// What a part's input is in the whole tick.
 fn source(part: PartName, input: &str) -> String {
-    let own = |name: &str| name.to_owned();
+    use PartName::{Dynamics, Encoder, Environment, Interaction, Policy, Robot};
     match (part, input) {
-        (PartName::Encoder, _) => own(inputs::IMAGE),
-        (PartName::Robot | PartName::Environment, "features") => "encoder/features".into(),
-        (PartName::Robot, "action") => own(inputs::ACTION),
-        (PartName::Robot, "state") => own(inputs::STATE),
-        (PartName::Robot, "noise") => own(inputs::ROBOT_NOISE),
-        (PartName::Robot, "z") => own(inputs::ROBOT_Z),
-        (PartName::Robot, _) => own(inputs::ROBOT_H),
+        (Policy, own) => own.to_owned(),
+        (Encoder, _) => inputs::IMAGE.into(),
+        (Robot | Dynamics | Environment, "features") => "encoder/features".into(),
+        (Robot | Dynamics, "action") => inputs::ACTION.into(),
+        (Robot | Dynamics, "state") => inputs::STATE.into(),
+        (Environment, "e") => "interaction/e".into(),
+        (Robot | Dynamics | Environment, own) => inputs::of_branch(part, own),
         // The robot's PRIOR sample: the interaction is known before the image is (A.2).
-        (PartName::Interaction, "robot_prior_z") => "robot/prior_z".into(),
-        (PartName::Interaction | PartName::Actor, "robot_h") => "robot/h_next".into(),
-        (PartName::Interaction, _) => own(inputs::ENVIRONMENT_Z),
-        (PartName::Environment, "e") => "interaction/e".into(),
-        (PartName::Environment, "noise") => own(inputs::ENVIRONMENT_NOISE),
-        (PartName::Environment, _) => own(inputs::ENVIRONMENT_H),
-        (_, "robot_z") => "robot/posterior_z".into(),
-        (_, "environment_z") => "environment/posterior_z".into(),
-        _ => "environment/h_next".into(),
+        (Interaction, "robot_prior_z") => "robot/prior_z".into(),
+        (Interaction, "environment_z") => inputs::of_branch(Environment, "z"),
+        // A head, or the interaction: the state as it is after the tick.
+        (_, input) => match input.rsplit_once('_') {
+            Some((branch, "z")) => format!("{branch}/posterior_z"),
+            Some((branch, _)) => format!("{branch}/h_next"),
+            None => input.to_owned(),
+        },
     }
 }
 
@@ -132,8 +141,8 @@ fn add(graph: &mut Graph, part: PartName, model: Model, facts: Vec<(String, Fact
     }
 }
 
-fn mark_late(graph: &mut Graph) {
-    let mut late: BTreeSet<String> = [inputs::IMAGE, inputs::STATE].map(str::to_owned).into();
+/// What depends on anything of `late` is late as well.
+fn mark_late(graph: &mut Graph, mut late: BTreeSet<String>) {
     for node in &mut graph.nodes {
         node.late = node.node.input.iter().any(|input| late.contains(input));
         if node.late {

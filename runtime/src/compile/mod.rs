@@ -1,4 +1,4 @@
-//! From the five exported ONNX files to what the tick runs.
+//! From the exported ONNX files to what the tick runs.
 //!
 //! 1. [`join`]: the parts become one graph, the whole tick, as they hang together in time.
 //! 2. [`fuse`]: groups of nodes that are hot become one node of our own each, and layouts are changed where that saves copies.
@@ -27,18 +27,12 @@ pub mod inputs {
     pub const STATE: &str = "state";
     /// The executed action.
     pub const ACTION: &str = "action";
-    /// Gumbel noise of the robot branch.
-    pub const ROBOT_NOISE: &str = "robot.noise";
-    /// Gumbel noise of the environment branch.
-    pub const ENVIRONMENT_NOISE: &str = "environment.noise";
-    /// Carried posterior z of the robot.
-    pub const ROBOT_Z: &str = "robot.z";
-    /// Carried h of the robot.
-    pub const ROBOT_H: &str = "robot.h";
-    /// Carried posterior z of the environment.
-    pub const ENVIRONMENT_Z: &str = "environment.z";
-    /// Carried h of the environment.
-    pub const ENVIRONMENT_H: &str = "environment.h";
+
+    /// What is a branch's own: its carried posterior `z` and `h`, and its Gumbel `noise`.
+    #[must_use]
+    pub fn of_branch(branch: rcwm_models::bundle::PartName, name: &str) -> String {
+        format!("{branch}.{name}")
+    }
 }
 
 /// What is done to the graph beside cutting it; each can be left out to see what it brings.
@@ -84,5 +78,5 @@ pub enum CompileError {
 pub fn compile(bundle: &Bundle, optimizations: Optimizations) -> Result<Vec<Segment>, CompileError> {
     let mut graph = join::join(bundle)?;
     fuse::fuse(&mut graph, optimizations);
-    Ok(segments::cut(&graph))
+    Ok(segments::cut(&graph, bundle.manifest.kind.parts()))
 }

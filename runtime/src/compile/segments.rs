@@ -26,8 +26,8 @@ pub struct Segment {
 }
 
 /// Early segments, then late ones, each in the order of the parts.
-pub(super) fn cut(graph: &Graph) -> Vec<Segment> {
-    let places = [false, true].into_iter().flat_map(|late| PartName::REQUIRED.map(|part| (part, late)));
+pub(super) fn cut(graph: &Graph, parts: &[PartName]) -> Vec<Segment> {
+    let places = [false, true].into_iter().flat_map(|late| parts.iter().map(move |part| (*part, late)));
     places.filter_map(|(part, late)| segment(graph, part, late)).collect()
 }
 

@@ -3,10 +3,14 @@
 use rcwm_models::wire::LinkError;
 
 use super::Cause;
+use crate::policy::NoSuchSurprise;
 
 /// Why the loop could not go on.
 #[derive(Debug, thiserror::Error)]
 pub enum ControllerError {
+    /// A limit of a surprise that the policy does not have.
+    #[error(transparent)]
+    NoSuchSurprise(#[from] NoSuchSurprise),
     /// The link failed.
     #[error(transparent)]
     Link(#[from] LinkError),
@@ -95,6 +99,7 @@ impl From<&ControllerError> for Ended {
             | ControllerError::Panicked(_)
             | ControllerError::FallbackNumbers { .. }
             | ControllerError::FallbackLimits { .. }
+            | ControllerError::NoSuchSurprise(_)
             | ControllerError::ZeroIsAPose => Self::Failed,
         }
     }

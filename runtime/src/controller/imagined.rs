@@ -52,14 +52,14 @@ mod tests {
 
     fn state(h: f32) -> State {
         let branch = || BranchState { z: vec![1; 4], h: vec![h; 8] };
-        State { robot: branch(), environment: branch() }
+        State { branches: vec![branch(), branch()] }
     }
 
     #[test]
     fn the_state_before_a_tick_is_found_and_its_memory_is_used_again() {
         let mut imagined = Imagined::new(2, &state(0.0));
         let places = |imagined: &Imagined| -> Vec<_> {
-            imagined.before.iter().map(|(_, state)| state.robot.h.as_ptr()).collect()
+            imagined.before.iter().map(|(_, state)| state.branches[0].h.as_ptr()).collect()
         };
         let ready = places(&imagined);
         for round in 0..5 {

@@ -49,6 +49,8 @@ pub enum Cause {
     RobotSurprise,
     /// The environment's surprise is over its limit: the scene is not as expected.
     EnvironmentSurprise,
+    /// The surprise of a world model of one branch is over its limit.
+    DynamicsSurprise,
 }
 
 impl std::fmt::Display for Cause {
@@ -60,6 +62,7 @@ impl std::fmt::Display for Cause {
             Self::Engine => "the engine fails",
             Self::RobotSurprise => "the robot's surprise is over its limit",
             Self::EnvironmentSurprise => "the environment's surprise is over its limit",
+            Self::DynamicsSurprise => "the world model's surprise is over its limit",
         })
     }
 }

@@ -37,7 +37,9 @@ pub use report::{Counters, Pace, RunReport};
 pub use safety_filter::{Fallback, Passed, SafetyFilter};
 pub use sequence::{Arrival, SequenceTracker};
 pub use settings::ControllerSettings;
-pub use surprise::{BranchSurprise, SurpriseLimits, SurpriseReport};
+pub use surprise::{BranchSurprise, SurpriseReport};
+
+pub use crate::policy::SurpriseLimits;
 pub use tick::{Tick, TickObserver, TickTimes};
 pub use transport::Transport;
 
@@ -147,7 +149,7 @@ impl Controller {
             tracker: SequenceTracker::default(),
             pacing: Pacing::new(settings.pacing),
             filter,
-            inputs: InputReader::of(&policy.manifest().policy),
+            inputs: InputReader::of(policy.manifest()),
             telemetry: Telemetry::new(),
             surprise: SurpriseTelemetry::new(),
             counters: Counters::default(),
@@ -178,7 +180,7 @@ impl Controller {
             && swapper.poll(moment, &mut self.policy)
         {
             self.filter.take_limits(self.policy.limits());
-            self.inputs = InputReader::of(&self.policy.manifest().policy);
+            self.inputs = InputReader::of(self.policy.manifest());
             self.imagined.clear();
             self.fresh_policy = true;
             self.counters.swaps += 1;
@@ -395,6 +397,7 @@ impl Controller {
 
 /// The safety filter of a policy under these settings.
 fn safety_filter(policy: &Policy, settings: &ControllerSettings) -> Result<SafetyFilter, ControllerError> {
+    settings.surprise.check(policy.manifest().kind)?;
     let limits = policy.limits();
     let all_are_positions = (0..limits.numbers()).all(|at| limits.is_absolute(at));
     match settings.fallback {

@@ -4,7 +4,7 @@ use serde::Serialize;
 
 use rcwm_models::bundle::Manifest;
 
-use super::{Arrival, Ended, EpisodeResult, Episodes, State, SurpriseReport};
+use super::{Arrival, BranchSurprise, Ended, EpisodeResult, Episodes, State, SurpriseReport};
 use crate::EngineKind;
 use crate::realtime::Granted;
 use crate::telemetry::{Latency, table};
@@ -38,6 +38,8 @@ pub struct Counters {
     pub robot_surprises: u64,
     /// The same of the environment branch.
     pub environment_surprises: u64,
+    /// The same of a world model of one branch.
+    pub dynamics_surprises: u64,
     /// Ticks whose work ahead was for another action than was executed, and was done again.
     pub recomputed: u64,
     /// Ticks for which the second thread came too late, so that the first computed its branch too.
@@ -288,19 +290,18 @@ impl RunReport {
     }
 
     fn surprise_line(&self) -> String {
-        let Some(SurpriseReport { robot, environment, .. }) = self.surprise else { return String::new() };
+        let Some(report) = self.surprise else { return String::new() };
         let c = &self.counters;
-        format!(
-            "surprise   robot p50 {:.2} p99 {:.2} max {:.2} nats ({} over), environment p50 {:.2} p99 {:.2} max {:.2} nats ({} \
-             over)\n",
-            robot.p50_nats,
-            robot.p99_nats,
-            robot.max_nats,
-            c.robot_surprises,
-            environment.p50_nats,
-            environment.p99_nats,
-            environment.max_nats,
-            c.environment_surprises
-        )
+        let branches = [
+            ("robot ", report.robot, c.robot_surprises),
+            ("environment ", report.environment, c.environment_surprises),
+            // There is no other to tell it from.
+            ("", report.dynamics, c.dynamics_surprises),
+        ];
+        let said = branches.into_iter().filter_map(|(name, branch, over)| {
+            let BranchSurprise { p50_nats, p99_nats, max_nats } = branch?;
+            Some(format!("{name}p50 {p50_nats:.2} p99 {p99_nats:.2} max {max_nats:.2} nats ({over} over)"))
+        });
+        format!("surprise   {}\n", said.collect::<Vec<_>>().join(", "))
     }
 }

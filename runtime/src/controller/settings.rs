@@ -4,8 +4,9 @@ use std::time::Duration;
 
 use rcwm_models::wire::LinkSettings;
 
-use super::{Fallback, SurpriseLimits, TickLimits};
+use super::{Fallback, TickLimits};
 use crate::pacing::PacingSettings;
+use crate::policy::SurpriseLimits;
 
 /// How the loop runs.
 #[derive(Debug, Clone)]

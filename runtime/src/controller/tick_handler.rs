@@ -1,5 +1,6 @@
 //! One tick: with an observation, or without one.
 
+use rcwm_models::bundle::PartName;
 use rcwm_models::wire::{
     Action, ActionSource, ActionValues, Observation, ObservationFlags, ObservationSample,
 };
@@ -171,12 +172,15 @@ impl Controller {
         let surprise = decision.surprise.filter(|_| !is_first);
         let Some(surprise) = surprise else { return (Some(decision), Event::Decided) };
         self.surprise.record(&surprise);
-        let exceeded = self.settings.surprise.exceeded_by(&surprise);
-        match exceeded {
-            Some(Cause::RobotSurprise) => self.counters.robot_surprises += 1,
-            Some(_) => self.counters.environment_surprises += 1,
-            None => {}
-        }
+        let exceeded = self.settings.surprise.exceeded_by(&surprise).map(|branch| match branch {
+            PartName::Robot => (Cause::RobotSurprise, &mut self.counters.robot_surprises),
+            PartName::Dynamics => (Cause::DynamicsSurprise, &mut self.counters.dynamics_surprises),
+            _ => (Cause::EnvironmentSurprise, &mut self.counters.environment_surprises),
+        });
+        let exceeded = exceeded.map(|(cause, count)| {
+            *count += 1;
+            cause
+        });
         (Some(decision), exceeded.map_or(Event::Decided, Event::Invalid))
     }
 
@@ -263,7 +267,8 @@ impl Controller {
         Ok(())
     }
 
-    /// The policy on an imagined frame; the fallback where that fails.
+    /// The policy on an imagined frame; the fallback where that fails. What a policy without a world model holds is no imagination, and
+    /// marked as the fallback that it is.
     fn imagine(
         &mut self,
         sequence: u64,
@@ -271,7 +276,11 @@ impl Controller {
     ) -> Result<(Option<Decision>, Chosen), ControllerError> {
         self.imagined.note(sequence, self.policy.state());
         match self.policy.imagine(held) {
-            Ok(decision) => Ok((Some(decision), (ActionSource::Imagined, Some(decision.action)))),
+            Ok(decision) => {
+                let imagined = self.policy.imagines();
+                let source = if imagined { ActionSource::Imagined } else { ActionSource::Fallback };
+                Ok((Some(decision), (source, Some(decision.action))))
+            }
             Err(error) => {
                 self.imagined.take_back();
                 let cause = self.count_failure(&error);

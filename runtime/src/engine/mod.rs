@@ -292,7 +292,8 @@ struct Source<'a> {
 pub fn load(bundle: &Bundle, part: PartName, settings: EngineSettings) -> Result<Box<dyn Part>, EngineError> {
     let bytes = bundle.part(part).ok_or(EngineError::NoPart { part })?;
     weights::check(part, bytes, weights::WEIGHT_MAX)?;
-    let (inputs, outputs) = part.signature(&bundle.manifest.model);
+    let entry = bundle.manifest.part(part).ok_or(EngineError::NoPart { part })?;
+    let (inputs, outputs) = (entry.inputs.clone(), entry.outputs.clone());
     let source = Source { part, bytes, inputs, outputs };
     match settings.kind {
         EngineKind::Tract => Ok(Box::new(tract::TractPart::load(source)?)),

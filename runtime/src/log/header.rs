@@ -6,7 +6,7 @@ use serde::{Deserialize, Serialize};
 
 use crate::controller::Fallback;
 use crate::engine::EngineSettings;
-use crate::policy::Sampling;
+use crate::policy::{STAGES, Sampling};
 
 /// Most threads that a run may have.
 const THREADS_MAX: usize = 64;
@@ -127,11 +127,12 @@ impl BundleIdentity {
     /// What another bundle differs in, as far as it matters for a tick; none where it is the same.
     #[must_use]
     pub fn difference(&self, other: &Self) -> Option<String> {
-        let names = ["initial", "encoder", "robot", "interaction", "environment", "actor"];
+        let parts = STAGES.iter().map(|part| part.as_str());
         let of = |bundle: &Self, name: &str| {
             bundle.sha256.iter().find(|(part, _)| part == name).map(|(_, sha256)| sha256.clone())
         };
-        let differing = names.into_iter().find(|name| of(self, name) != of(other, name));
+        let differing =
+            std::iter::once("initial").chain(parts).find(|name| of(self, name) != of(other, name));
         let short = |sha256: Option<String>| {
             sha256.map_or("missing".into(), |sha256| sha256.chars().take(12).collect::<String>())
         };

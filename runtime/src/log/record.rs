@@ -226,7 +226,7 @@ pub enum LoggedOutcome {
     Failed(String),
 }
 
-/// z and h of both branches, and where the random generator stands.
+/// z and h of every branch, and where the random generator stands. A policy of one branch has the first only.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 pub struct WholeState {
     robot_z: Vec<i64>,
@@ -240,31 +240,28 @@ impl WholeState {
     /// Of the policy's state, and where its random generator stands.
     #[must_use]
     pub fn of(state: &State, noise_position: u128) -> Self {
-        Self {
-            robot_z: state.robot.z.clone(),
-            robot_h: state.robot.h.clone(),
-            environment_z: state.environment.z.clone(),
-            environment_h: state.environment.h.clone(),
-            noise_position,
-        }
+        let mut branches = state.branches.iter().map(|branch| (branch.z.clone(), branch.h.clone()));
+        let mut next = || branches.next().unwrap_or_default();
+        let ((robot_z, robot_h), (environment_z, environment_h)) = (next(), next());
+        Self { robot_z, robot_h, environment_z, environment_h, noise_position }
     }
 
     /// The policy's state, and where its random generator stands.
     #[must_use]
     pub fn restore(&self) -> (State, u128) {
         let branch = |z: &[i64], h: &[f32]| BranchState { z: z.to_vec(), h: h.to_vec() };
-        let state = State {
-            robot: branch(&self.robot_z, &self.robot_h),
-            environment: branch(&self.environment_z, &self.environment_h),
-        };
-        (state, self.noise_position)
+        let mut branches = vec![branch(&self.robot_z, &self.robot_h)];
+        if !self.environment_h.is_empty() {
+            branches.push(branch(&self.environment_z, &self.environment_h));
+        }
+        (State { branches }, self.noise_position)
     }
 }
 
-/// The first half of the sha256 over the bits of z and h of both branches.
+/// The first half of the sha256 over the bits of z and h of every branch.
 pub fn digest(state: &State) -> [u8; DIGEST_BYTES] {
     let mut hash = Sha256::new();
-    for branch in [&state.robot, &state.environment] {
+    for branch in &state.branches {
         branch.z.iter().for_each(|class| hash.update(class.to_le_bytes()));
         branch.h.iter().for_each(|value| hash.update(value.to_le_bytes()));
     }

@@ -94,6 +94,7 @@ impl CallOutcome {
             PolicyError::Engine(_)
             | PolicyError::Bundle(_)
             | PolicyError::Compile(_)
+            | PolicyError::NothingToSample
             | PolicyError::Thread(_) => Self::EngineFailed,
         }
     }

@@ -14,7 +14,7 @@ use rcwm_models::bundle::{Bundle, PartName};
 use rcwm_models::wire::ActionValues;
 use tract_onnx::prelude::TractResult;
 
-use super::parts::finite;
+use super::buffers::finite;
 use super::stages::StageClock;
 use super::tick::{Tick, Work};
 use super::{Buffers, Inputs, PolicyError};
@@ -49,7 +49,8 @@ impl Compiled {
     ) -> Result<Self, PolicyError> {
         let weight_max =
             if optimizations.half_weights { weights::HALF_WEIGHT_MAX } else { weights::WEIGHT_MAX };
-        for part in PartName::REQUIRED {
+        let kind = bundle.manifest.kind;
+        for part in kind.parts().iter().copied() {
             weights::check(part, bundle.part(part).ok_or(EngineError::NoPart { part })?, weight_max)?;
         }
         let team = match threads {
@@ -60,12 +61,13 @@ impl Compiled {
         let mut values = Values::default();
         let (mut early, mut late) = (Vec::new(), Vec::new());
         for segment in compile(bundle, optimizations)? {
-            // The branches run beside one another: there is nobody to share with within them.
-            let shares = segment.late && matches!(segment.part, PartName::Encoder | PartName::Actor);
+            // Two branches run beside one another: there is nobody to share with within them.
+            let shares =
+                segment.late && !(kind.branches().len() > 1 && kind.branches().contains(&segment.part));
             let piece = Piece::load(&segment, &mut values, team.as_ref().filter(|_| shares))?;
             if segment.late { late.push(piece) } else { early.push(piece) }
         }
-        let places = Places::of(&values, &early)?;
+        let places = Places::of(kind, &values, &early)?;
         let mut late = |part: PartName| {
             let found =
                 late.iter().position(|piece: &Piece| piece.part == part).map(|index| late.remove(index));
@@ -73,7 +75,8 @@ impl Compiled {
             found.ok_or_else(|| CompileError::Part { part, reason: reason() })
         };
         let (encoder, actor) = (late(PartName::Encoder)?, late(PartName::Actor)?);
-        let branches = Branches::new(late(PartName::Robot)?, late(PartName::Environment)?, team.as_ref())?;
+        let branches = kind.branches().iter().map(|part| late(*part)).collect::<Result<_, _>>()?;
+        let branches = Branches::new(branches, team.as_ref())?;
         Ok(Self { values, places, early, encoder, branches, actor, team })
     }
 
@@ -97,20 +100,19 @@ impl Compiled {
     /// The tick's inputs but the image.
     fn fill(&mut self, action: &ActionValues, work: &Work<'_>) -> TractResult<()> {
         let (Self { values, places, .. }, Work { state, noise, .. }) = (self, work);
-        let Places { robot, environment, .. } = places;
         values.fill(places.action, action)?;
-        values.fill(robot.z, &state.robot.z)?;
-        values.fill(robot.h, &state.robot.h)?;
-        values.fill(robot.noise, noise.robot())?;
-        values.fill(environment.z, &state.environment.z)?;
-        values.fill(environment.h, &state.environment.h)?;
-        values.fill(environment.noise, noise.environment())
+        for ((at, state), noise) in places.branches.iter().zip(&state.branches).zip(noise.branches()) {
+            values.fill(at.z, &state.z)?;
+            values.fill(at.h, &state.h)?;
+            values.fill(at.noise, noise)?;
+        }
+        Ok(())
     }
 
     /// What the early pieces have made.
     fn copy_priors(&self, buffers: &mut Buffers) -> Result<(), PolicyError> {
         let Self { values, places, .. } = self;
-        for ((part, branch), at) in buffers.branches().into_iter().zip(places.branches()) {
+        for ((part, branch), at) in buffers.named().zip(&places.branches) {
             let mut copy = || {
                 values.copy(at.h_next, &mut branch.h_next)?;
                 values.copy(at.prior_z, &mut branch.prior_z)?;
@@ -118,9 +120,10 @@ impl Compiled {
             };
             copy().map_err(|error| run_error(part, &error))?;
         }
+        let Some([e, attention]) = places.interaction else { return Ok(()) };
         let mut copy = || {
-            values.copy(places.e, &mut buffers.e)?;
-            values.copy(places.attention, &mut buffers.attention)
+            values.copy(e, &mut buffers.e)?;
+            values.copy(attention, &mut buffers.attention)
         };
         copy().map_err(|error| run_error(PartName::Interaction, &error))
     }
@@ -128,7 +131,7 @@ impl Compiled {
     /// What the branches have made of the image.
     fn copy_posteriors(&self, buffers: &mut Buffers) -> Result<(), PolicyError> {
         let Self { values, places, .. } = self;
-        for ((part, branch), at) in buffers.branches().into_iter().zip(places.branches()) {
+        for ((part, branch), at) in buffers.named().zip(&places.branches) {
             let mut copy = || {
                 values.copy(at.posterior_z, &mut branch.posterior_z)?;
                 values.copy(at.posterior_log_probs, &mut branch.posterior_log_probs)
@@ -151,7 +154,8 @@ fn run_error(part: PartName, error: &tract_onnx::prelude::TractError) -> PolicyE
 
 impl Tick for Compiled {
     fn work_ahead(&mut self, action: &ActionValues, work: &mut Work<'_>) -> Result<(), PolicyError> {
-        self.fill(action, work).map_err(|error| run_error(PartName::Robot, &error))?;
+        let first = self.early.first().map_or(PartName::Actor, |piece| piece.part);
+        self.fill(action, work).map_err(|error| run_error(first, &error))?;
         for piece in &mut self.early {
             piece.run(&mut self.values).map_err(|error| run_error(piece.part, &error))?;
             work.clock.ended(piece.part);
@@ -176,7 +180,7 @@ impl Tick for Compiled {
     }
 
     fn imagine(&mut self, work: &mut Work<'_>) -> Result<(), PolicyError> {
-        for at in self.places.branches() {
+        for at in &self.places.branches {
             self.values.alias(at.prior_z, at.posterior_z);
         }
         work.buffers.believe_prior();

@@ -20,6 +20,11 @@ pub enum PolicyError {
     /// The second thread could not be started.
     #[error("starting the tick's second thread: {0}; use --threads 1")]
     Thread(String),
+    /// Sampling was asked of a policy that gives one action and no distribution.
+    #[error(
+        "--sample: a policy of kind recurrent gives one action and no distribution to sample from; leave it out"
+    )]
+    NothingToSample,
     /// What was observed is not fit for the policy.
     #[error("observation refused: {0}")]
     Observation(String),

@@ -3,7 +3,7 @@
 use std::ops::Range;
 use std::sync::Arc;
 
-use rcwm_models::bundle::{PartName, PolicyInputs};
+use rcwm_models::bundle::Manifest;
 use rcwm_models::interface::Interface;
 use rcwm_models::wire::{Format, Observation};
 
@@ -12,7 +12,8 @@ use super::Policy;
 /// What a policy decides on.
 #[derive(Debug, Clone, Copy)]
 pub struct Inputs<'a> {
-    /// The cameras side by side, pixel by pixel: [S, S, 3 C], upright, RGB.
+    /// Upright, RGB. Of kinds with a world model the cameras side by side, pixel by pixel: [S, S, 3 C]; else one after another, [H, W, 3]
+    /// each.
     pub image: &'a [u8],
     /// The measured numbers, in units; empty where the policy reads none.
     pub state: &'a [f32],
@@ -28,6 +29,8 @@ impl<'a, I: AsRef<[u8]> + ?Sized> From<&'a I> for Inputs<'a> {
 #[derive(Debug)]
 pub struct InputReader {
     inputs: Vec<String>,
+    /// Cameras go side by side, else one after another.
+    side_by_side: bool,
     /// Of the last format, and what was found in it.
     places: Option<(Arc<Format>, Places)>,
     image: Vec<u8>,
@@ -50,15 +53,15 @@ impl Places {
                 None => places.states.push(robot.state_range(name)?),
             }
         }
-        (!places.cameras.is_empty()).then_some(places)
+        Some(places)
     }
 }
 
 impl InputReader {
     #[must_use]
-    pub fn of(policy: &PolicyInputs) -> Self {
-        let inputs = policy.inputs.clone();
-        Self { inputs, places: None, image: Vec::new(), state: Vec::new() }
+    pub fn of(manifest: &Manifest) -> Self {
+        let (inputs, side_by_side) = (manifest.policy.inputs.clone(), manifest.model.is_some());
+        Self { inputs, side_by_side, places: None, image: Vec::new(), state: Vec::new() }
     }
 
     /// The inputs; none where the observation is of a robot that lacks one. Allocates nothing after the first of a robot.
@@ -75,6 +78,13 @@ impl InputReader {
         }
         if let [camera] = places.cameras[..] {
             return Some(Inputs { image: observation.image(camera), state: &self.state });
+        }
+        if !self.side_by_side {
+            self.image.clear();
+            for camera in &places.cameras {
+                self.image.extend_from_slice(observation.image(*camera));
+            }
+            return Some(Inputs { image: &self.image, state: &self.state });
         }
         self.image.resize(places.cameras.iter().map(|camera| observation.image(*camera).len()).sum(), 0);
         let cameras = places.cameras.len();
@@ -95,18 +105,17 @@ impl Policy {
         if found != expected {
             return Some(format!("the image has {found} bytes, expected {expected}"));
         }
-        let (found, expected) = (inputs.state.len(), self.manifest.model.state);
+        let (found, expected) = (inputs.state.len(), self.manifest.measured_numbers());
         if found != expected {
             return Some(format!("the state has {found} numbers, expected {expected}"));
         }
         inputs.state.iter().any(|x| !x.is_finite()).then(|| "the state holds what is no number".to_owned())
     }
 
-    /// Bytes of the encoder's image.
+    /// Bytes of all cameras' images.
     #[must_use]
     pub fn image_bytes(&self) -> usize {
-        let encoder = self.manifest.parts.iter().find(|part| part.name == PartName::Encoder);
-        encoder.and_then(|part| part.inputs.first()).map_or(0, |image| image.shape.iter().product())
+        self.manifest.image_bytes()
     }
 }
 
@@ -132,10 +141,11 @@ mod tests {
             observation.edit().image(camera).fill(value);
         }
         observation.edit().state().iter_mut().enumerate().for_each(|(at, x)| *x = at as f32);
-        let reader = |names: &[&str]| {
+        let arranged = |names: &[&str], side_by_side| {
             let inputs = names.iter().map(|name| (*name).to_owned()).collect();
-            InputReader::of(&PolicyInputs { inputs, limits: None })
+            InputReader { inputs, side_by_side, places: None, image: Vec::new(), state: Vec::new() }
         };
+        let reader = |names: &[&str]| arranged(names, true);
         let mut both = reader(&["front", "finger_vel", "top"]);
         let found = both.read(&observation.view()).unwrap();
         assert_eq!(
@@ -145,5 +155,12 @@ mod tests {
         assert_eq!(found.state, [16.0, 17.0]);
         assert_eq!(reader(&["wrist"]).read(&observation.view()).unwrap().image[..2], [2, 2]);
         assert!(reader(&["front", "side"]).read(&observation.view()).is_none());
+        let mut one_after_another = arranged(&["front", "top"], false);
+        let found = one_after_another.read(&observation.view()).unwrap().image;
+        let one = 64 * 64 * 3;
+        assert_eq!((found.len(), found[0], found[one - 1], found[one]), (2 * one, 3, 3, 1));
+        let nothing =
+            arranged(&["finger_vel"], false).read(&observation.view()).map(|found| found.image.len());
+        assert_eq!(nothing, Some(0));
     }
 }

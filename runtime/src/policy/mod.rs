@@ -12,31 +12,39 @@
 //! mean, std       = actor(z^R, h^R, z^E, h^E)
 //! ```
 
+mod buffers;
 mod calls;
 mod compiled;
 mod error;
+mod held;
 mod inputs;
 mod limits;
 mod noise;
 mod parts;
+mod recurrent;
 mod sequential;
 mod stages;
 mod state;
+mod surprise;
 mod tick;
 
+pub use buffers::{BranchBuffers, Buffers};
 pub use calls::{CALLS_MAX, Call, CallKind, CallOutcome};
 pub use error::PolicyError;
 pub use inputs::{InputReader, Inputs};
 pub use limits::ActionLimits;
 pub use noise::Sampling;
-pub use parts::{BranchBuffers, Buffers};
-pub use state::{BranchState, State, Surprise};
+
+pub use recurrent::Graph;
+pub use state::{BranchState, State};
+pub use surprise::{NoSuchSurprise, Surprise, SurpriseLimits};
 
 use std::path::{Path, PathBuf};
 use std::time::Instant;
 
-use rcwm_models::bundle::{Bundle, Manifest, PartName};
+use rcwm_models::bundle::{Bundle, BundleKind, Manifest, PartName};
 use rcwm_models::interface::Normaliser;
+use rcwm_models::settings::ModelSettings;
 use rcwm_models::wire::ActionValues;
 
 use crate::engine::{EngineSettings, Form};
@@ -45,8 +53,16 @@ use noise::NoiseSource;
 use stages::StageClock;
 use tick::{Tick, Work};
 
-/// Stages of a tick that are timed one by one, in the order they run.
-pub const STAGES: [PartName; 5] = PartName::REQUIRED;
+/// Stages of a tick that are timed one by one, in the order they run: of each kind some.
+pub const STAGES: [PartName; 7] = [
+    PartName::Encoder,
+    PartName::Robot,
+    PartName::Interaction,
+    PartName::Environment,
+    PartName::Dynamics,
+    PartName::Policy,
+    PartName::Actor,
+];
 
 /// What the policy decided on one observation.
 #[derive(Debug, Clone, Copy, PartialEq)]
@@ -105,18 +121,20 @@ impl Policy {
     /// A policy of a checked bundle.
     ///
     /// # Errors
-    /// [`PolicyError::Engine`].
+    /// [`PolicyError::Engine`], or [`PolicyError::NothingToSample`].
     pub fn new(bundle: &Bundle, engine: EngineSettings, sampling: Sampling) -> Result<Self, PolicyError> {
-        let model = &bundle.manifest.model;
+        if bundle.manifest.model.is_none() && sampling != Sampling::Mode {
+            return Err(PolicyError::NothingToSample);
+        }
         let initial = State::from(&bundle.initial);
         let mut policy = Self {
             limits: ActionLimits::of(&bundle.manifest),
             normaliser: Normaliser::of(&bundle.manifest.interface),
             tick: load_tick(bundle, engine)?,
-            buffers: Buffers::new(model),
+            buffers: Buffers::new(&bundle.manifest, &initial),
             state: initial.clone(),
             initial,
-            noise: NoiseSource::new(sampling, model),
+            noise: noise_of(&bundle.manifest, sampling),
             folder: bundle.folder.clone(),
             manifest: bundle.manifest.clone(),
             ahead: None,
@@ -128,7 +146,7 @@ impl Policy {
 
     /// Runs some ticks on a black image, so that the first real one finds memory and caches ready.
     fn warm_up(&mut self, sampling: Sampling) -> Result<(), PolicyError> {
-        let (image, state) = (vec![0; self.image_bytes()], vec![0.0; self.manifest.model.state]);
+        let (image, state) = (vec![0; self.image_bytes()], vec![0.0; self.manifest.measured_numbers()]);
         let inputs = Inputs { image: &image, state: &state };
         let middle = self.limits.clamp(ActionValues::zeros(self.limits.numbers()));
         for tick in 0..3 {
@@ -139,7 +157,7 @@ impl Policy {
             }
             self.warm_caches();
         }
-        self.noise = NoiseSource::new(sampling, &self.manifest.model);
+        self.noise = noise_of(&self.manifest, sampling);
         self.ahead = None;
         self.calls = CallRing::new();
         self.reset();
@@ -167,7 +185,7 @@ impl Policy {
         };
         self.decide(CallKind::Observe, executed_action, before, |tick, work| {
             tick.observe(inputs, work)?;
-            Ok(Some(work.buffers.surprise()))
+            Ok(work.buffers.surprise())
         })
     }
 
@@ -198,16 +216,43 @@ impl Policy {
         self.tick.wake();
     }
 
+    /// Whether there is a world model, which imagines what is not observed.
+    #[must_use]
+    pub fn imagines(&self) -> bool {
+        self.manifest.model.is_some()
+    }
+
     /// Goes on without an image: the world model imagines the missing frame. The prior stands in for the posterior, and the state is
-    /// carried on from it.
+    /// carried on from it. A policy without a world model decides on the action that was executed last once more, and its state stays.
     ///
     /// # Errors
     /// As [`Self::observe`].
     pub fn imagine(&mut self, executed_action: &ActionValues) -> Result<Decision, PolicyError> {
         let before = self.before(Some(executed_action));
+        if !self.imagines() {
+            let result = before.map(|_| self.hold(executed_action));
+            self.calls.note(CallKind::Imagine, Some(executed_action), (&result).into());
+            return result;
+        }
         self.decide(CallKind::Imagine, Some(executed_action), before, |tick, work| {
             tick.imagine(work).map(|()| None)
         })
+    }
+
+    /// The action that was executed last, as far as the limits allow it.
+    fn hold(&self, executed_action: &ActionValues) -> Decision {
+        let mut mean = *executed_action;
+        // Finite: see `before`.
+        let _ = self.normaliser.from_units(executed_action, &mut mean);
+        Decision {
+            action: self.limits.clamp(*executed_action),
+            mean,
+            std: ActionValues::zeros(mean.len()),
+            stage_ns: [0; STAGES.len()],
+            surprise: None,
+            recomputed: false,
+            helper_late: false,
+        }
     }
 
     /// What stands before the tick; an episode's start goes back to the learned initial state.
@@ -282,7 +327,7 @@ impl Policy {
         let (mean, std) = (self.buffers.mean, self.buffers.std);
         let decided = self.noise.action(&mean, &std);
         // A sample of two finite numbers can be too large for one: no limit makes that an action.
-        parts::finite(PartName::Actor, "mean", &decided)?;
+        buffers::finite(PartName::Actor, "mean", &decided)?;
         self.buffers.give_posterior(&mut self.state);
         let mut action = decided;
         // Finite: see above.
@@ -297,96 +342,17 @@ impl Policy {
             self.state.clone_from(&self.initial);
         }
     }
-
-    /// The state carried into the next tick: posterior z and h of both branches.
-    #[must_use]
-    pub fn state(&self) -> &State {
-        &self.state
-    }
-
-    /// Carries on from another state.
-    ///
-    /// # Errors
-    /// [`PolicyError::Observation`] when its sizes are not the model's, or it holds a class that does not exist or a number that is not
-    /// finite: what is carried on enters the parts as it is.
-    pub fn set_state(&mut self, state: &State) -> Result<(), PolicyError> {
-        if !state.same_sizes(&self.initial) {
-            return Err(PolicyError::Observation("the state is of another model's size".into()));
-        }
-        if !state.is_of_classes(self.manifest.model.classes) {
-            let what = "the state holds a class that does not exist, or a number that is not finite";
-            return Err(PolicyError::Observation(what.into()));
-        }
-        self.state.clone_from(state);
-        self.ahead = None;
-        self.calls.note(CallKind::SetState, None, CallOutcome::StateSet { checksum: state.checksum() });
-        Ok(())
-    }
-
-    /// Every value of the last tick, for monitoring and for checking.
-    #[must_use]
-    pub fn buffers(&self) -> &Buffers {
-        &self.buffers
-    }
-
-    /// Uses this noise in the ticks that follow instead of its own: Gumbel noise `[2, n, m]` of the robot and of the
-    /// environment, flat.
-    ///
-    /// # Errors
-    /// [`PolicyError::Observation`] when a length is not `2 n m`.
-    pub fn set_noise(&mut self, robot: &[f32], environment: &[f32]) -> Result<(), PolicyError> {
-        self.ahead = None;
-        self.noise.set(robot, environment)
-    }
-
-    /// The bundle's folder.
-    #[must_use]
-    pub fn folder(&self) -> &Path {
-        &self.folder
-    }
-
-    /// A number that no other policy of this process has.
-    #[must_use]
-    pub fn number(&self) -> u64 {
-        self.calls.policy()
-    }
-
-    /// Calls of [`Self::observe`], [`Self::imagine`], [`Self::work_ahead`] and [`Self::set_state`] so far.
-    #[must_use]
-    pub fn calls_made(&self) -> u64 {
-        self.calls.made()
-    }
-
-    /// The calls from number `first` on; at most the last [`CALLS_MAX`] are remembered.
-    pub fn calls_since(&self, first: u64) -> impl Iterator<Item = &Call> {
-        self.calls.since(first)
-    }
-
-    /// Where the generator of [`Sampling::Sample`] stands before what the next tick draws; 0 without one.
-    #[must_use]
-    pub fn noise_position(&self) -> u128 {
-        self.noise.position(self.ahead.is_some())
-    }
-
-    /// Goes on drawing from there; what was worked ahead is forgotten.
-    pub fn set_noise_position(&mut self, position: u128) {
-        self.ahead = None;
-        self.noise.set_position(position);
-    }
-
-    /// The bundle's manifest.
-    #[must_use]
-    pub fn manifest(&self) -> &Manifest {
-        &self.manifest
-    }
-
-    /// The bundle's limits of actions.
-    #[must_use]
-    pub fn limits(&self) -> ActionLimits {
-        self.limits
-    }
 }
+
+fn noise_of(manifest: &Manifest, sampling: Sampling) -> NoiseSource {
+    let width = manifest.model.as_ref().map_or(0, ModelSettings::stoch_width);
+    NoiseSource::new(sampling, manifest.kind.branches().len(), width)
+}
+
 fn load_tick(bundle: &Bundle, settings: EngineSettings) -> Result<Box<dyn Tick>, PolicyError> {
+    if bundle.manifest.kind == BundleKind::Recurrent {
+        return Ok(Box::new(recurrent::Recurrent::load(bundle, settings)?));
+    }
     Ok(match settings.form {
         Form::Exported => Box::new(sequential::Sequential::load(bundle, settings)?),
         Form::Compiled(optimizations) => {

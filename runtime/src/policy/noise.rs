@@ -2,7 +2,6 @@
 
 use rand::{Rng, SeedableRng};
 use rand_chacha::ChaCha8Rng;
-use rcwm_models::settings::ModelSettings;
 use rcwm_models::wire::ActionValues;
 
 use super::PolicyError;
@@ -25,26 +24,25 @@ pub(super) struct NoiseSource {
     rng: Option<ChaCha8Rng>,
     /// Where the generator stood before the current tick's draw.
     drawn_from: u128,
-    /// Robot's, then the environment's: each prior's, then posterior's, `[2, n, m]`.
-    robot: Vec<f32>,
-    environment: Vec<f32>,
+    /// Of each branch: the prior's, then the posterior's, `[2, n, m]`.
+    branches: Vec<Vec<f32>>,
 }
 
 impl NoiseSource {
-    pub(super) fn new(sampling: Sampling, model: &ModelSettings) -> Self {
+    /// For so many branches, each of so many categoricals times classes.
+    pub(super) fn new(sampling: Sampling, branches: usize, width: usize) -> Self {
         let rng = match sampling {
             Sampling::Mode => None,
             Sampling::Sample { seed } => Some(ChaCha8Rng::seed_from_u64(seed)),
         };
-        let zeros = vec![0.0; 2 * model.stoch_width()];
-        Self { rng, drawn_from: 0, robot: zeros.clone(), environment: zeros }
+        Self { rng, drawn_from: 0, branches: vec![vec![0.0; 2 * width]; branches] }
     }
 
     /// Fresh Gumbel noise for a tick; nothing when the mode is wanted.
     pub(super) fn draw(&mut self) {
         if let Some(rng) = &mut self.rng {
             self.drawn_from = rng.get_word_pos();
-            for value in self.robot.iter_mut().chain(&mut self.environment) {
+            for value in self.branches.iter_mut().flatten() {
                 *value = gumbel(rng);
             }
         }
@@ -65,24 +63,23 @@ impl NoiseSource {
         }
     }
 
-    pub(super) fn set(&mut self, robot: &[f32], environment: &[f32]) -> Result<(), PolicyError> {
-        let len = self.robot.len();
-        if robot.len() != len || environment.len() != len {
-            let found = (robot.len(), environment.len());
-            return Err(PolicyError::Observation(format!("noise of lengths {found:?}, expected {len} each")));
+    pub(super) fn set(&mut self, noise: &[&[f32]]) -> Result<(), PolicyError> {
+        if !noise.iter().map(|of| of.len()).eq(self.branches.iter().map(Vec::len)) {
+            let lens = |found: Vec<usize>| format!("{found:?}");
+            let (found, expected) = (noise.iter().map(|of| of.len()), self.branches.iter().map(Vec::len));
+            let (found, expected) = (lens(found.collect()), lens(expected.collect()));
+            return Err(PolicyError::Observation(format!("noise of lengths {found}, expected {expected}")));
         }
         self.rng = None;
-        self.robot.copy_from_slice(robot);
-        self.environment.copy_from_slice(environment);
+        for (to, from) in self.branches.iter_mut().zip(noise) {
+            to.copy_from_slice(from);
+        }
         Ok(())
     }
 
-    pub(super) fn robot(&self) -> &[f32] {
-        &self.robot
-    }
-
-    pub(super) fn environment(&self) -> &[f32] {
-        &self.environment
+    /// Gumbel noise `[2, n, m]` of each branch.
+    pub(super) fn branches(&self) -> &[Vec<f32>] {
+        &self.branches
     }
 
     pub(super) fn action(&mut self, mean: &ActionValues, std: &ActionValues) -> ActionValues {
@@ -112,17 +109,16 @@ fn uniform(rng: &mut ChaCha8Rng) -> f64 {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use rcwm_models::settings::{ModelKind, Preset};
 
     fn source(sampling: Sampling) -> NoiseSource {
-        NoiseSource::new(sampling, &ModelSettings::preset(Preset::Paper, ModelKind::Rcwm))
+        NoiseSource::new(sampling, 2, 1024)
     }
 
     #[test]
     fn the_mode_has_no_noise_and_acts_with_the_mean() {
         let mut noise = source(Sampling::Mode);
         noise.draw();
-        assert!(noise.robot().iter().chain(noise.environment()).all(|x| *x == 0.0));
+        assert!(noise.branches().iter().flatten().all(|x| *x == 0.0));
         assert_eq!(noise.action(&[0.5; 4].into(), &[1.0; 4].into()), [0.5; 4]);
     }
 
@@ -131,7 +127,7 @@ mod tests {
         let (mut a, mut b) = (source(Sampling::Sample { seed: 7 }), source(Sampling::Sample { seed: 7 }));
         a.draw();
         b.draw();
-        assert_eq!(a.robot(), b.robot());
+        assert_eq!(a.branches(), b.branches());
         assert_eq!(
             a.action(&[0.0; 4].into(), &[1.0; 4].into()),
             b.action(&[0.0; 4].into(), &[1.0; 4].into())

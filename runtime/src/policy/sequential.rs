@@ -10,7 +10,7 @@ use super::tick::{Tick, Work};
 use super::{Inputs, PolicyError};
 use crate::engine::{EngineError, EngineSettings};
 
-/// The five parts of a tick and the action before it.
+/// The parts of a tick and the action before it.
 pub(super) struct Sequential {
     parts: Parts,
     action: ActionValues,
@@ -20,20 +20,10 @@ pub(super) struct Sequential {
 
 impl Sequential {
     pub(super) fn load(bundle: &Bundle, settings: EngineSettings) -> Result<Self, EngineError> {
-        let model = &bundle.manifest.model;
-        let (action, state) = (ActionValues::zeros(model.action), vec![0.0; model.state]);
+        let manifest = &bundle.manifest;
+        let action = ActionValues::zeros(manifest.interface.action_numbers());
+        let state = vec![0.0; manifest.measured_numbers()];
         Ok(Self { parts: Parts::load(bundle, settings)?, action, state })
-    }
-
-    fn branches(&mut self, work: &mut Work<'_>) -> Result<(), PolicyError> {
-        let Work { state, noise, buffers, clock } = work;
-        self.parts.run_robot(&state.robot, &self.action, &self.state, noise.robot(), buffers)?;
-        clock.ended(PartName::Robot);
-        self.parts.run_interaction(&state.environment, buffers)?;
-        clock.ended(PartName::Interaction);
-        self.parts.run_environment(&state.environment, noise.environment(), buffers)?;
-        clock.ended(PartName::Environment);
-        Ok(())
     }
 
     fn act(&mut self, work: &mut Work<'_>) -> Result<(), PolicyError> {
@@ -55,13 +45,13 @@ impl Tick for Sequential {
         self.state.extend_from_slice(inputs.state);
         self.parts.run_encoder(inputs.image, work.buffers)?;
         work.clock.ended(PartName::Encoder);
-        self.branches(work)?;
+        self.parts.run_branches(&self.action, &self.state, work)?;
         self.act(work)
     }
 
     /// The branches run on the features of the last image; what they make of them is not used.
     fn imagine(&mut self, work: &mut Work<'_>) -> Result<(), PolicyError> {
-        self.branches(work)?;
+        self.parts.run_branches(&self.action, &self.state, work)?;
         work.buffers.believe_prior();
         self.act(work)
     }

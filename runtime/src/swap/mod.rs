@@ -46,7 +46,7 @@ use rcwm_models::interface::{Interface, Mismatch};
 use rcwm_models::wire::LinkSettings;
 
 use crate::engine::EngineSettings;
-use crate::policy::{Policy, PolicyError, Sampling};
+use crate::policy::{NoSuchSurprise, Policy, PolicyError, Sampling, SurpriseLimits};
 use crate::verify::VerifyError;
 use handover::Handover;
 use server::Server;
@@ -84,6 +84,9 @@ pub enum SwapError {
     /// The bundle was made for another robot.
     #[error("the bundle is for another robot than the running one: {0}; start a new run")]
     DoesNotFit(Mismatch),
+    /// The run has a limit of a surprise that the new policy does not have.
+    #[error("the run was started with {0}; start a new run")]
+    Surprise(#[from] NoSuchSurprise),
     /// Loading panicked; the thread that loads has gone on.
     #[error("loading the bundle failed inside the engine: {0}; export it again")]
     Panicked(String),
@@ -142,6 +145,8 @@ pub struct SwapSettings {
     pub sampling: Sampling,
     /// That of the running policy; another one must fit it.
     pub interface: Interface,
+    /// The run's limits; another policy must have what they limit.
+    pub surprise: SurpriseLimits,
 }
 
 /// How long the end of a run waits for its server.

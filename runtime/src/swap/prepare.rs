@@ -46,6 +46,7 @@ fn try_prepare(
     if let Some(mismatch) = bundle.manifest.mismatches(&settings.interface).into_iter().next() {
         return Err(SwapError::DoesNotFit(mismatch));
     }
+    settings.surprise.check(bundle.manifest.kind)?;
     still_wanted()?;
     // In the form that will run: its threads, its weights.
     let report = verify(&bundle, settings.engine, TOLERANCE, &mut || {})?;

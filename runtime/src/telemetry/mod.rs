@@ -40,6 +40,10 @@ pub enum Stage {
     Interaction,
     /// Environment branch.
     Environment,
+    /// The one branch of `dreamer`.
+    Dynamics,
+    /// All of `recurrent`.
+    Policy,
     Actor,
     /// Observation received -> action published.
     Tick,
@@ -57,13 +61,15 @@ pub enum Stage {
 
 impl Stage {
     /// All stages, in the order of a tick.
-    pub const ALL: [Self; 13] = [
+    pub const ALL: [Self; 15] = [
         Self::PublishLag,
         Self::Receive,
         Self::Encoder,
         Self::Robot,
         Self::Interaction,
         Self::Environment,
+        Self::Dynamics,
+        Self::Policy,
         Self::Actor,
         Self::Tick,
         Self::EndToEnd,
@@ -74,8 +80,15 @@ impl Stage {
     ];
 
     /// The stages of the policy, in the order of [`STAGES`].
-    pub const POLICY: [Self; STAGES.len()] =
-        [Self::Encoder, Self::Robot, Self::Interaction, Self::Environment, Self::Actor];
+    pub const POLICY: [Self; STAGES.len()] = [
+        Self::Encoder,
+        Self::Robot,
+        Self::Interaction,
+        Self::Environment,
+        Self::Dynamics,
+        Self::Policy,
+        Self::Actor,
+    ];
 
     /// The name in tables and files.
     #[must_use]
@@ -87,6 +100,8 @@ impl Stage {
             Self::Robot => "robot",
             Self::Interaction => "interaction",
             Self::Environment => "environment",
+            Self::Dynamics => "dynamics",
+            Self::Policy => "policy",
             Self::Actor => "actor",
             Self::Tick => "tick",
             Self::EndToEnd => "end_to_end",

@@ -2,42 +2,64 @@
 
 use std::path::PathBuf;
 
-use rcwm_models::bundle::{Bundle, DType, PartName, TensorSpec};
-use rcwm_models::interface::Normaliser;
+use rcwm_models::bundle::{Bundle, CARRIED, CARRIED_NEXT, DType, PartName, TensorSpec};
+use rcwm_models::interface::{Camera, Normaliser};
 use rcwm_models::tensors::{Tensors, TensorsError, Values};
 use rcwm_models::wire::ActionValues;
 
 use super::VerifyError;
-use crate::policy::{Inputs, State};
-
-pub(super) const BRANCHES: [PartName; 2] = [PartName::Robot, PartName::Environment];
+use crate::policy::{BranchState, Inputs, State};
 
 /// Typed access to a bundle's golden values.
-pub(super) struct Golden<'a> {
+pub struct Golden<'a> {
     bundle: &'a Bundle,
     /// Ticks for which everything that a tick needs is there.
-    pub(super) ticks: usize,
+    pub ticks: usize,
+    /// Of a policy without a world model: each tick's cameras, one after another.
+    images: Vec<u8>,
 }
 
 impl<'a> Golden<'a> {
-    pub(super) fn of(bundle: &'a Bundle) -> Result<Self, VerifyError> {
-        let mut this = Self { bundle, ticks: usize::MAX };
-        let noise_len = 2 * bundle.manifest.model.stoch_width();
-        let encoder = bundle.manifest.parts.iter().find(|part| part.name == PartName::Encoder);
-        let image = encoder.and_then(|part| part.inputs.first());
-        let image_bytes = image.map_or(0, |image| image.shape.iter().product());
-        let ticks = [
-            this.rows("input/image", DType::U8, image_bytes)?,
-            this.rows("input/action", DType::F32, bundle.manifest.model.action)?,
+    /// Checks that everything that a tick needs is there.
+    ///
+    /// # Errors
+    /// [`VerifyError::Golden`] says what is missing or of another type or size.
+    pub fn of(bundle: &'a Bundle) -> Result<Self, VerifyError> {
+        let mut this = Self { bundle, ticks: usize::MAX, images: Vec::new() };
+        let manifest = &bundle.manifest;
+        let mut ticks = vec![
+            this.rows("input/action", DType::F32, manifest.interface.action_numbers())?,
             this.rows("input/is_first", DType::U8, 1)?,
-            this.rows("input/robot_noise", DType::F32, noise_len)?,
-            this.rows("input/environment_noise", DType::F32, noise_len)?,
         ];
-        let state = bundle.manifest.model.state;
-        let measured = if state == 0 { usize::MAX } else { this.rows("input/state", DType::F32, state)? };
-        this.ticks = ticks.into_iter().chain([measured]).min().unwrap_or(0);
+        let measured = manifest.measured_numbers();
+        if measured > 0 {
+            ticks.push(this.rows("input/state", DType::F32, measured)?);
+        }
+        match &manifest.model {
+            Some(model) => {
+                ticks.push(this.rows("input/image", DType::U8, manifest.image_bytes())?);
+                for branch in manifest.kind.branches() {
+                    ticks.push(this.rows(&noise_name(*branch), DType::F32, 2 * model.stoch_width())?);
+                }
+            }
+            None => {
+                for camera in manifest.cameras() {
+                    let len = camera.shape.iter().product();
+                    ticks.push(this.rows(&camera_name(camera), DType::U8, len)?);
+                }
+            }
+        }
+        this.ticks = ticks.into_iter().min().unwrap_or(0);
         if this.ticks == 0 {
             return Err(this.wrong(TensorsError::Missing { name: "input/*, at least one tick".into() }));
+        }
+        if manifest.model.is_none() {
+            for tick in 0..this.ticks {
+                for camera in manifest.cameras() {
+                    let image = this.u8(&camera_name(camera), tick)?;
+                    this.images.extend_from_slice(image);
+                }
+            }
         }
         Ok(this)
     }
@@ -114,16 +136,25 @@ impl<'a> Golden<'a> {
         })
     }
 
-    pub(super) fn image(&self, tick: usize) -> Result<&'a [u8], VerifyError> {
-        self.u8("input/image", tick)
+    pub(super) fn image(&self, tick: usize) -> Result<&[u8], VerifyError> {
+        if self.bundle.manifest.model.is_some() {
+            return self.u8("input/image", tick);
+        }
+        let len = self.bundle.manifest.image_bytes();
+        Ok(self.images.get(tick * len..(tick + 1) * len).unwrap_or_default())
     }
 
-    /// The measured state; empty where the model reads none.
+    /// The measured state; empty where the policy reads none.
     pub(super) fn measured(&self, tick: usize) -> Result<&'a [f32], VerifyError> {
-        if self.bundle.manifest.model.state == 0 { Ok(&[]) } else { self.f32("input/state", tick) }
+        let reads_none = self.bundle.manifest.measured_numbers() == 0;
+        if reads_none { Ok(&[]) } else { self.f32("input/state", tick) }
     }
 
-    pub(super) fn inputs(&self, tick: usize) -> Result<Inputs<'a>, VerifyError> {
+    /// What the policy sees at a tick.
+    ///
+    /// # Errors
+    /// [`VerifyError::Golden`] for a tick that is not there.
+    pub fn inputs(&self, tick: usize) -> Result<Inputs<'_>, VerifyError> {
         Ok(Inputs { image: self.image(tick)?, state: self.measured(tick)? })
     }
 
@@ -134,7 +165,7 @@ impl<'a> Golden<'a> {
     /// The action that leads to the tick, as the model has it: zeros where an episode begins.
     pub(super) fn action(&self, tick: usize) -> Result<ActionValues, VerifyError> {
         if self.is_first(tick)? {
-            return Ok(ActionValues::zeros(self.bundle.manifest.model.action));
+            return Ok(ActionValues::zeros(self.bundle.manifest.interface.action_numbers()));
         }
         Ok(self.f32("input/action", tick)?.iter().copied().collect())
     }
@@ -157,7 +188,7 @@ impl<'a> Golden<'a> {
 
     /// Gumbel noise of a branch, `[2, n, m]`.
     pub(super) fn noise(&self, branch: PartName, tick: usize) -> Result<&'a [f32], VerifyError> {
-        self.f32(&format!("input/{branch}_noise"), tick)
+        self.f32(&noise_name(branch), tick)
     }
 
     pub(super) fn expect_f32(
@@ -177,7 +208,7 @@ impl<'a> Golden<'a> {
     ) -> Result<&'a [i64], VerifyError> {
         let name = expect_name(part, output);
         let indices = self.i64(&name, tick)?;
-        let classes = self.bundle.manifest.model.classes as i64;
+        let classes = self.bundle.manifest.model.as_ref().map_or(0, |model| model.classes) as i64;
         // They enter parts as indices of a table's rows.
         match indices.iter().find(|class| !(0..classes).contains(*class)) {
             None => Ok(indices),
@@ -191,12 +222,28 @@ impl<'a> Golden<'a> {
 
     /// The state after a tick.
     pub(super) fn state_after(&self, tick: usize) -> Result<State, VerifyError> {
-        let mut state = State::default();
-        for (branch, to) in BRANCHES.into_iter().zip([&mut state.robot, &mut state.environment]) {
-            to.z = self.expect_i64(branch, "posterior_z", tick)?.to_vec();
-            to.h = self.expect_f32(branch, "h_next", tick)?.to_vec();
+        let manifest = &self.bundle.manifest;
+        if manifest.model.is_none() {
+            return self.carried_after(tick);
         }
-        Ok(state)
+        let branch = |branch: &PartName| -> Result<BranchState, VerifyError> {
+            let z = self.expect_i64(*branch, "posterior_z", tick)?.to_vec();
+            Ok(BranchState { z, h: self.expect_f32(*branch, "h_next", tick)?.to_vec() })
+        };
+        Ok(State { branches: manifest.kind.branches().iter().map(branch).collect::<Result<_, _>>()? })
+    }
+
+    /// The same of a policy that carries tensors of its own.
+    fn carried_after(&self, tick: usize) -> Result<State, VerifyError> {
+        let mut all = BranchState::default();
+        let entry = self.bundle.manifest.part(PartName::Policy);
+        for input in entry.iter().flat_map(|entry| &entry.inputs) {
+            if let Some(name) = input.name.strip_prefix(CARRIED) {
+                let next = format!("{CARRIED_NEXT}{name}");
+                all.h.extend_from_slice(self.expect_f32(PartName::Policy, &next, tick)?);
+            }
+        }
+        Ok(State { branches: vec![all] })
     }
 
     /// The state that enters a tick: the initial one at the first of an episode.
@@ -216,8 +263,8 @@ impl<'a> Golden<'a> {
         tick: usize,
         categorical: usize,
     ) -> Result<f32, VerifyError> {
-        let model = &self.bundle.manifest.model;
-        let (n, m) = (model.categoricals, model.classes);
+        let (n, m) =
+            self.bundle.manifest.model.as_ref().map_or((0, 0), |model| (model.categoricals, model.classes));
         let output = ["prior_log_probs", "posterior_log_probs"][index];
         let log_probs = &self.expect_f32(branch, output, tick)?[categorical * m..][..m];
         let noise = &self.noise(branch, tick)?[(index * n + categorical) * m..][..m];
@@ -227,6 +274,14 @@ impl<'a> Golden<'a> {
 
 fn expect_name(part: PartName, output: &str) -> String {
     format!("expect/{part}/{output}")
+}
+
+fn noise_name(branch: PartName) -> String {
+    format!("input/{branch}_noise")
+}
+
+fn camera_name(camera: &Camera) -> String {
+    format!("input/{}", camera.name)
 }
 
 fn two_best_apart(scores: impl Iterator<Item = f32>) -> f32 {

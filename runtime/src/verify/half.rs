@@ -18,7 +18,7 @@ pub const HALF_TICKS: usize = 1000;
 pub struct HalfReport {
     /// Ticks compared.
     pub ticks: usize,
-    /// Latents drawn: prior and posterior of both branches.
+    /// Latents drawn: prior and posterior of every branch.
     pub latents: usize,
     /// Those of them whose class differs.
     pub classes_differ: usize,
@@ -54,13 +54,14 @@ pub fn half_weights(bundle: &Bundle) -> Result<HalfReport, VerifyError> {
         executed = (tick % 50 != 49).then_some(right.action);
     }
     report.ticks = HALF_TICKS;
-    report.action_error_mean = (error_sum / (HALF_TICKS * bundle.manifest.model.action) as f64) as f32;
+    report.action_error_mean =
+        (error_sum / (HALF_TICKS * bundle.manifest.interface.action_numbers()) as f64) as f32;
     Ok(report)
 }
 
 impl HalfReport {
     fn compare(&mut self, exact: &Buffers, half: &Buffers) {
-        for (exact, half) in [(&exact.robot, &half.robot), (&exact.environment, &half.environment)] {
+        for (exact, half) in exact.branches.iter().zip(&half.branches) {
             for (exact, half) in [(&exact.prior_z, &half.prior_z), (&exact.posterior_z, &half.posterior_z)] {
                 self.latents += exact.len();
                 self.classes_differ += exact.iter().zip(half).filter(|(exact, half)| exact != half).count();

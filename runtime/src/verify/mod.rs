@@ -17,6 +17,7 @@ mod half;
 mod parts;
 mod recurrent;
 
+pub use golden::Golden;
 pub use half::{HALF_TICKS, HalfReport, half_weights};
 
 use std::path::PathBuf;
@@ -27,7 +28,6 @@ use serde::Serialize;
 
 use crate::engine::{self, EngineError, EngineKind, EngineSettings};
 use crate::policy::PolicyError;
-use golden::Golden;
 use recurrent::Start;
 
 /// Largest error of an action over the recurrent run.
@@ -73,7 +73,7 @@ pub struct OutputError {
 #[derive(Debug, Clone, PartialEq, Serialize)]
 pub struct Flip {
     pub tick: usize,
-    /// `robot` or `environment`.
+    /// `robot`, `environment` or `dynamics`.
     pub branch: PartName,
     /// `prior_z` or `posterior_z`.
     pub output: &'static str,
@@ -115,9 +115,10 @@ pub struct RecurrentReport {
     pub ticks_compared: usize,
     /// Largest error of the mean action.
     pub mean_error_max: f32,
-    /// Largest error of the action's standard deviation.
-    pub std_error_max: f32,
-    /// Largest error of h, both branches.
+    /// Largest error of the action's standard deviation; none where the policy gives none.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub std_error_max: Option<f32>,
+    /// Largest error of what is carried on: h of every branch.
     pub h_error_max: f32,
     /// Classes that differ.
     pub flips: Vec<Flip>,
@@ -154,8 +155,9 @@ pub fn verify(
     engine::available(kind)?;
     let (mut parts, mut unchecked_parts) = (Vec::new(), Vec::new());
     let mut checker = parts::Checker::new(bundle, &golden, settings)?;
-    for part in PartName::ALL.into_iter().filter(|part| bundle.part(*part).is_some()) {
-        if golden.has(part) || PartName::REQUIRED.contains(&part) {
+    let kind_of_bundle = bundle.manifest.kind;
+    for part in kind_of_bundle.all_parts().filter(|part| bundle.part(*part).is_some()) {
+        if golden.has(part) || kind_of_bundle.parts().contains(&part) {
             parts.push(checker.check(part, progress)?);
         } else {
             unchecked_parts.push(part);
@@ -202,7 +204,8 @@ fn failures(parts: &[PartReport], recurrent: &RecurrentReport, tolerance: f32) -
 }
 
 fn action_failures(run: &str, report: &RecurrentReport, tolerance: f32) -> Vec<String> {
-    let errors = [("mean", report.mean_error_max), ("std", report.std_error_max)].into_iter();
+    let std = report.std_error_max.map(|error| ("std", error));
+    let errors = std::iter::once(("mean", report.mean_error_max)).chain(std);
     let wrong = errors.filter(|(_, error)| exceeds(*error, tolerance));
     wrong
         .map(|(what, error)| {
@@ -257,8 +260,13 @@ impl EngineReport {
         }
         let r = &self.recurrent;
         text += &format!(
-            "  {:<12} {} ticks, {} without a flip; mean {:.1e}  std {:.1e}  h {:.1e}\n",
-            "whole tick", r.ticks, r.ticks_compared, r.mean_error_max, r.std_error_max, r.h_error_max
+            "  {:<12} {} ticks, {} without a flip; mean {:.1e}  {}h {:.1e}\n",
+            "whole tick",
+            r.ticks,
+            r.ticks_compared,
+            r.mean_error_max,
+            r.std_error_max.map(|error| format!("std {error:.1e}  ")).unwrap_or_default(),
+            r.h_error_max
         );
         for flip in self.parts.iter().flat_map(|part| &part.flips) {
             text += &flip.text("alone");

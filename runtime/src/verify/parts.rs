@@ -1,20 +1,33 @@
 //! Every part alone, on the inputs the trainer had.
 
-use rcwm_models::bundle::{Bundle, DType, PartName, TensorSpec};
+use rcwm_models::bundle::{Bundle, DType, PartEntry, PartName, TensorSpec};
+use rcwm_models::wire::ActionValues;
 
 use super::golden::Golden;
 use super::{Flip, OutputError, PartReport, VerifyError};
-use crate::engine::{self, EngineSettings, Input, Output, Part};
-use crate::policy::State;
+use crate::engine::{self, EngineError, EngineSettings, Input, Output, Part};
+use crate::policy::{Graph, State};
 
 pub(super) struct Checker<'a> {
     bundle: &'a Bundle,
     golden: &'a Golden<'a>,
     settings: EngineSettings,
-    /// For ticks whose golden features were left out of the file.
-    encoder: Box<dyn Part>,
+    /// Where the kind has one.
+    encoder: Option<Encoder>,
+}
+
+/// For ticks whose golden features were left out of the file.
+struct Encoder {
+    part: Box<dyn Part>,
+    covered: usize,
     features: Vec<f32>,
-    features_covered: usize,
+}
+
+/// A part, ready to run.
+enum Loaded {
+    Part(Box<dyn Part>),
+    /// All of a policy without a world model.
+    Policy(Graph),
 }
 
 /// One output's place and what was found about it.
@@ -32,16 +45,15 @@ impl<'a> Checker<'a> {
         golden: &'a Golden<'a>,
         settings: EngineSettings,
     ) -> Result<Self, VerifyError> {
-        let (_, outputs) = PartName::Encoder.signature(&bundle.manifest.model);
-        let features = &outputs[0];
-        Ok(Self {
-            bundle,
-            golden,
-            settings,
-            encoder: engine::load(bundle, PartName::Encoder, settings)?,
-            features: vec![0.0; features.shape.iter().product()],
-            features_covered: golden.covered(PartName::Encoder, features)?,
-        })
+        let encoder = bundle.manifest.part(PartName::Encoder).map(|entry| {
+            let features = &entry.outputs[0];
+            Ok::<_, VerifyError>(Encoder {
+                part: engine::load(bundle, PartName::Encoder, settings)?,
+                covered: golden.covered(PartName::Encoder, features)?,
+                features: vec![0.0; features.shape.iter().product()],
+            })
+        });
+        Ok(Self { bundle, golden, settings, encoder: encoder.transpose()? })
     }
 
     pub(super) fn check(
@@ -49,11 +61,15 @@ impl<'a> Checker<'a> {
         part: PartName,
         progress: &mut dyn FnMut(),
     ) -> Result<PartReport, VerifyError> {
-        let mut loaded = engine::load(self.bundle, part, self.settings)?;
-        let (_, outputs) = part.signature(&self.bundle.manifest.model);
-        let mut places = outputs
-            .into_iter()
-            .map(|spec| Ok(Place::new(self.golden.covered(part, &spec)?, spec)))
+        let mut loaded = match part {
+            PartName::Policy => Loaded::Policy(Graph::load(self.bundle, self.settings)?),
+            _ => Loaded::Part(engine::load(self.bundle, part, self.settings)?),
+        };
+        let entry = self.bundle.manifest.part(part).ok_or(EngineError::NoPart { part })?;
+        let mut places = entry
+            .outputs
+            .iter()
+            .map(|spec| Ok(Place::new(self.golden.covered(part, spec)?, spec.clone())))
             .collect::<Result<Vec<_>, VerifyError>>()?;
         let mut flips = Vec::new();
         for tick in 0..self.golden.ticks {
@@ -61,7 +77,7 @@ impl<'a> Checker<'a> {
             if places.iter().all(|place| place.covered <= tick) {
                 continue;
             }
-            self.run(part, loaded.as_mut(), tick, &mut places)?;
+            self.run(entry, &mut loaded, tick, &mut places)?;
             for place in places.iter_mut().filter(|place| place.covered > tick) {
                 place.compare(self.golden, part, tick, &mut flips)?;
             }
@@ -72,68 +88,83 @@ impl<'a> Checker<'a> {
 
     fn run(
         &mut self,
-        part: PartName,
-        loaded: &mut dyn Part,
+        entry: &PartEntry,
+        loaded: &mut Loaded,
         tick: usize,
         places: &mut [Place],
     ) -> Result<(), VerifyError> {
         let golden = self.golden;
-        let mut outputs: Vec<_> = places.iter_mut().map(Place::output).collect();
-        let before = golden.state_before(tick)?;
-        let action = golden.action(tick)?;
-        match part {
-            PartName::Encoder => loaded.run(&[Input::U8(golden.image(tick)?)], &mut outputs)?,
-            PartName::Robot => {
-                let noise = Input::F32(golden.noise(part, tick)?);
-                let State { robot, .. } = &before;
-                let features = Input::F32(self.features(tick)?);
-                let measured = golden.measured(tick)?;
-                let inputs = [
-                    Input::I64(&robot.z),
-                    Input::F32(&robot.h),
-                    Input::F32(&action),
-                    features,
-                    noise,
-                    Input::F32(measured),
-                ];
-                loaded.run(&inputs[..if measured.is_empty() { 5 } else { 6 }], &mut outputs)?;
+        let (before, action) = (golden.state_before(tick)?, golden.action(tick)?);
+        match loaded {
+            Loaded::Policy(graph) => {
+                graph.run(golden.inputs(tick)?, &action, &before.branches[0].h)?;
+                for (place, found) in places.iter_mut().zip(graph.outputs()) {
+                    place.f32.copy_from_slice(found);
+                }
             }
-            PartName::Interaction => {
-                let inputs = [
-                    Input::I64(golden.expect_i64(PartName::Robot, "prior_z", tick)?),
-                    Input::F32(golden.expect_f32(PartName::Robot, "h_next", tick)?),
-                    Input::I64(&before.environment.z),
-                ];
-                loaded.run(&inputs, &mut outputs)?;
-            }
-            PartName::Environment => {
-                let noise = Input::F32(golden.noise(part, tick)?);
-                let e = Input::F32(golden.expect_f32(PartName::Interaction, "e", tick)?);
-                let features = Input::F32(self.features(tick)?);
-                loaded.run(&[e, Input::F32(&before.environment.h), features, noise], &mut outputs)?;
-            }
-            PartName::Actor | PartName::Reward | PartName::Continue | PartName::Decoder => {
-                let State { robot, environment } = golden.state_after(tick)?;
-                let inputs = [
-                    Input::I64(&robot.z),
-                    Input::F32(&robot.h),
-                    Input::I64(&environment.z),
-                    Input::F32(&environment.h),
-                ];
-                loaded.run(&inputs, &mut outputs)?;
+            Loaded::Part(part) => {
+                if entry.inputs.iter().any(|input| input.name == "features") {
+                    self.encode(tick)?;
+                }
+                let after = golden.state_after(tick)?;
+                let states = States { before: &before, after: &after, action: &action };
+                let inputs =
+                    entry.inputs.iter().map(|input| self.input(entry.name, &input.name, &states, tick));
+                let inputs = inputs.collect::<Result<Vec<_>, VerifyError>>()?;
+                let mut outputs: Vec<_> = places.iter_mut().map(Place::output).collect();
+                part.run(&inputs, &mut outputs)?;
             }
         }
         Ok(())
     }
 
-    fn features(&mut self, tick: usize) -> Result<&[f32], VerifyError> {
-        if tick < self.features_covered {
-            return self.golden.expect_f32(PartName::Encoder, "features", tick);
+    /// What the trainer gave to an input of a part.
+    fn input<'b>(
+        &'b self,
+        part: PartName,
+        name: &str,
+        states: &States<'b>,
+        tick: usize,
+    ) -> Result<Input<'b>, VerifyError> {
+        let (golden, branches) = (self.golden, self.bundle.manifest.kind.branches());
+        let own = || branches.iter().position(|branch| *branch == part).unwrap_or(0);
+        Ok(match (part, name) {
+            (_, "image") => Input::U8(golden.image(tick)?),
+            (_, "features") => Input::F32(self.encoder.as_ref().map_or(&[], |encoder| &encoder.features)),
+            (_, "action") => Input::F32(states.action),
+            (_, "state") => Input::F32(golden.measured(tick)?),
+            (_, "noise") => Input::F32(golden.noise(part, tick)?),
+            (_, "z") => Input::I64(&states.before.branches[own()].z),
+            (_, "h") => Input::F32(&states.before.branches[own()].h),
+            (_, "e") => Input::F32(golden.expect_f32(PartName::Interaction, "e", tick)?),
+            (_, "robot_prior_z") => Input::I64(golden.expect_i64(PartName::Robot, "prior_z", tick)?),
+            // It runs before the environment has moved on.
+            (PartName::Interaction, "environment_z") => Input::I64(&states.before.branches[1].z),
+            (_, of_branch) => {
+                let is_of = |branch: &PartName| of_branch.starts_with(branch.as_str());
+                let branch = &states.after.branches[branches.iter().position(is_of).unwrap_or(0)];
+                if of_branch.ends_with("_z") { Input::I64(&branch.z) } else { Input::F32(&branch.h) }
+            }
+        })
+    }
+
+    /// The features of a tick.
+    fn encode(&mut self, tick: usize) -> Result<(), VerifyError> {
+        let Some(Encoder { part, covered, features }) = &mut self.encoder else { return Ok(()) };
+        if tick < *covered {
+            features.copy_from_slice(self.golden.expect_f32(PartName::Encoder, "features", tick)?);
+            return Ok(());
         }
         let image = Input::U8(self.golden.image(tick)?);
-        self.encoder.run(&[image], &mut [Output::F32(&mut self.features)])?;
-        Ok(&self.features)
+        Ok(part.run(&[image], &mut [Output::F32(features)])?)
     }
+}
+
+/// What the trainer had around a tick.
+struct States<'a> {
+    before: &'a State,
+    after: &'a State,
+    action: &'a ActionValues,
 }
 
 impl Place {

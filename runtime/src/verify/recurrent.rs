@@ -1,8 +1,8 @@
 //! The whole tick, carrying its own state.
 
-use rcwm_models::bundle::{Bundle, PartName};
+use rcwm_models::bundle::{Bundle, BundleKind, PartName};
 
-use super::golden::{BRANCHES, Golden};
+use super::golden::Golden;
 use super::parts::{error_max, note_flips, worst};
 use super::{Flip, RecurrentReport, VerifyError};
 use crate::engine::EngineSettings;
@@ -24,23 +24,25 @@ pub(super) fn run(
     start: Start,
     progress: &mut dyn FnMut(),
 ) -> Result<RecurrentReport, VerifyError> {
+    let kind = bundle.manifest.kind;
     let mut policy = Policy::new(bundle, settings, Sampling::Mode)?;
     let mut report = RecurrentReport {
         ticks: golden.ticks,
         ticks_compared: 0,
         mean_error_max: 0.0,
-        std_error_max: 0.0,
+        std_error_max: None,
         h_error_max: 0.0,
         flips: Vec::new(),
     };
     for tick in 0..golden.ticks {
         progress();
-        policy.set_noise(golden.noise(PartName::Robot, tick)?, golden.noise(PartName::Environment, tick)?)?;
+        let noise = kind.branches().iter().map(|branch| golden.noise(*branch, tick));
+        policy.set_noise(&noise.collect::<Result<Vec<_>, _>>()?)?;
         let action = if golden.is_first(tick)? { None } else { Some(golden.executed(tick)?) };
         policy.observe(golden.inputs(tick)?, action.as_ref())?;
-        let flips = flips_of(golden, policy.buffers(), tick)?;
+        let flips = flips_of(kind, golden, policy.buffers(), tick)?;
         if flips.is_empty() {
-            report.compare(golden, policy.buffers(), tick)?;
+            report.compare(kind, golden, &policy, tick)?;
         }
         // After a flip the state would go its own way: it goes on from the trainer's, so that later ticks still tell something.
         if start == Start::Golden || !flips.is_empty() {
@@ -52,9 +54,14 @@ pub(super) fn run(
 }
 
 /// The tick's flips, in the order they happen; what comes after the first may follow from it.
-fn flips_of(golden: &Golden<'_>, buffers: &Buffers, tick: usize) -> Result<Vec<Flip>, VerifyError> {
+fn flips_of(
+    kind: BundleKind,
+    golden: &Golden<'_>,
+    buffers: &Buffers,
+    tick: usize,
+) -> Result<Vec<Flip>, VerifyError> {
     let mut flips = Vec::new();
-    for (branch, found) in BRANCHES.into_iter().zip([&buffers.robot, &buffers.environment]) {
+    for (branch, found) in kind.branches().iter().copied().zip(&buffers.branches) {
         // Only the robot's prior is used within the tick: through the interaction it moves the environment (eq. 7).
         let prior_moved = flips.iter().any(|flip: &Flip| flip.output == "prior_z");
         let before = flips.len();
@@ -68,14 +75,26 @@ fn flips_of(golden: &Golden<'_>, buffers: &Buffers, tick: usize) -> Result<Vec<F
 }
 
 impl RecurrentReport {
-    fn compare(&mut self, golden: &Golden<'_>, found: &Buffers, tick: usize) -> Result<(), VerifyError> {
-        let actor = |output| golden.expect_f32(PartName::Actor, output, tick);
+    fn compare(
+        &mut self,
+        kind: BundleKind,
+        golden: &Golden<'_>,
+        policy: &Policy,
+        tick: usize,
+    ) -> Result<(), VerifyError> {
+        let found = policy.buffers();
         self.ticks_compared += 1;
-        self.mean_error_max = worst(self.mean_error_max, error_max(&found.mean, actor("mean")?));
-        self.std_error_max = worst(self.std_error_max, error_max(&found.std, actor("std")?));
-        for (branch, found) in BRANCHES.into_iter().zip([&found.robot, &found.environment]) {
-            let expected = golden.expect_f32(branch, "h_next", tick)?;
-            self.h_error_max = worst(self.h_error_max, error_max(&found.h_next, expected));
+        if kind == BundleKind::Recurrent {
+            let expected = golden.expect_f32(PartName::Policy, "action", tick)?;
+            self.mean_error_max = worst(self.mean_error_max, error_max(&found.mean, expected));
+        } else {
+            let actor = |output| golden.expect_f32(PartName::Actor, output, tick);
+            self.mean_error_max = worst(self.mean_error_max, error_max(&found.mean, actor("mean")?));
+            let std_error_max = self.std_error_max.get_or_insert(0.0);
+            *std_error_max = worst(*std_error_max, error_max(&found.std, actor("std")?));
+        }
+        for (expected, found) in golden.state_after(tick)?.branches.iter().zip(&found.branches) {
+            self.h_error_max = worst(self.h_error_max, error_max(&found.h_next, &expected.h));
         }
         Ok(())
     }

@@ -3,6 +3,7 @@
 #![allow(clippy::unwrap_used, reason = "a helper that fails fails its test")]
 
 pub mod counting;
+pub mod policies;
 
 use std::path::{Path, PathBuf};
 use std::sync::atomic::{AtomicBool, AtomicU32, Ordering};
@@ -37,6 +38,12 @@ pub fn smallest_bundle() -> PathBuf {
     };
     let smallest = folders.filter(|folder| folder.join(MANIFEST_FILE).is_file()).min_by_key(bytes);
     smallest.expect("at least one bundle is shipped in models/bundles")
+}
+
+/// A bundle of kind `dreamer` for the same robot: `rcwm-trainer init --model vanilla --preset debug --set deter=16 --set hidden=16
+/// --set cnn_depth=2 --set units=16 --seed 5`, then `export --parts required --golden-ticks 4`.
+pub fn dreamer_bundle() -> PathBuf {
+    Path::new(env!("CARGO_MANIFEST_DIR")).join("../data/dreamer")
 }
 
 /// A copy of the smallest bundle with a changed manifest.

@@ -3,7 +3,7 @@ use candle_core::{Result, Tensor};
 use crate::model::branch::Branch;
 use crate::model::latent::{Latent, Sampler, State};
 use crate::model::rcwm::{ENVIRONMENT, ROBOT, Rcwm};
-use crate::model::world::{World, normalised_action};
+use crate::model::world::World;
 
 /// The posterior states [K, ...] after `images` (u8 [K, 64, 64, 3]), from the states before them and the actions that led there
 /// [K, action]: one step of [`World::observe`] whose carried state is given.
@@ -19,9 +19,7 @@ pub fn filter_step(
     match world {
         World::Rcwm(model) => rcwm_step(model, previous, &embeds, actions, sampler),
         World::Vanilla(model) => {
-            let before = &previous.branches[0];
-            let x = Tensor::cat(&[&before.z.flatten_from(1)?, &normalised_action(actions)?], 1)?;
-            let h = model.branch.recur(&x, &before.h)?;
+            let h = model.recur(&previous.branches[0], actions)?;
             Ok(State { branches: vec![posterior(&model.branch, &h, &embeds[0], sampler)?] })
         }
     }

@@ -8,8 +8,7 @@ use std::time::Duration;
 use anyhow::{Context, Result, ensure};
 use candle_core::Device;
 use indicatif::{ProgressBar, ProgressStyle};
-use rcwm_models::bundle::PartName;
-use rcwm_models::settings::ModelKind;
+use rcwm_models::bundle::BundleKind;
 use rcwm_models::tasks::task_id;
 use rcwm_trainer::checkpoint::Checkpoint;
 use rcwm_trainer::evaluation::{
@@ -51,7 +50,7 @@ the episodes need masks. Beside it stands the error on the pixels outside the ro
 what other actions from the same start change in the imagined pictures. Windows end before the task
 is solved and the robot moves in them (--windows anywhere takes all). Checkpoints that differ in
 their training seed only are taken together: then intervals are over seeds. With --task: the policy is exported and deployed by rcwm-runtime in
-rcwm-simulator, in lock-step; a vanilla model, which no runtime deploys, decides in this process.
+rcwm-simulator, in lock-step; with --engine trainer it decides in this process.
 With --report: both, as one page that shows all that lies in the folder's parts; a part is measured
 again only if it is asked for from something else. Ctrl-C keeps what is done.")]
 #[command(group = clap::ArgGroup::new("recorded").multiple(true).args(["data", "report"]))]

@@ -7,7 +7,7 @@ use anyhow::{Context, Result, bail};
 use candle_core::Device;
 use clap::ValueEnum;
 use indicatif::{ProgressBar, ProgressStyle};
-use rcwm_models::bundle::{Bundle, PartName};
+use rcwm_models::bundle::{Bundle, BundleKind};
 use rcwm_models::interface::Interface;
 use rcwm_models::tasks;
 use rcwm_trainer::checkpoint::{Checkpoint, CheckpointError, SETTINGS_FILE};
@@ -70,7 +70,7 @@ pub struct Export {
 enum Parts {
     /// Every part, with reward, continue and decoder.
     All,
-    /// Encoder, robot, interaction, environment, actor.
+    /// Of rcwm encoder, robot, interaction, environment, actor; of vanilla encoder, dynamics, actor.
     Required,
 }
 
@@ -130,12 +130,13 @@ impl Export {
         if self.form == Form::Checkpoint {
             return self.checkpoint(&checkpoint);
         }
+        let kind = BundleKind::of(checkpoint.settings.model.kind);
         let options = Options {
             task: self.task.clone(),
             interface: self.interface()?,
             parts: match self.parts {
-                Parts::All => PartName::ALL.to_vec(),
-                Parts::Required => PartName::REQUIRED.to_vec(),
+                Parts::All => kind.all_parts().collect(),
+                Parts::Required => kind.parts().to_vec(),
             },
             golden_episode: self.golden_episode.clone(),
             golden_ticks: self.golden_ticks,

@@ -13,7 +13,7 @@ use crate::simulators::Launch;
 /// What a report of [`closed_loop_in_trainer`] gives as its engine.
 pub const TRAINER_ENGINE: &str = "trainer";
 
-/// Runs a policy in simulators and counts its successes, deciding in this process: for models that no runtime deploys, such as the vanilla
+/// Runs a policy in simulators and counts its successes, deciding in this process (`--engine trainer`), such as the vanilla
 /// baseline, and while a policy learns. The agent's parameters must be frozen. Layouts, episodes and what counts as success are those of [`super::closed_loop`].
 ///
 /// # Errors

@@ -22,7 +22,7 @@
 //! | `seeds` | sets of models over training seeds |
 //! | `statistics` | bootstrap over episodes and over training seeds, Wilson's interval |
 //! | `closed_loop` | success rate of the exported policy, by simulators and runtimes |
-//! | `closed_loop_in_trainer` | the same of a model that no runtime deploys |
+//! | `closed_loop_in_trainer` | the same without a runtime |
 //! | `closed_loop_results` | that, in the file that `--json` writes |
 //! | `film` | what was imagined, as a strip and animated |
 //! | `attention` | what the environment asks of the robot while a step is imagined |

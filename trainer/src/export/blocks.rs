@@ -14,10 +14,10 @@ pub struct Part<'a> {
     pub settings: &'a ModelSettings,
 }
 
-/// A state [1, n] of class indices and [1, d], of both branches.
+/// A state [1, n] of class indices and [1, d], of every branch.
 pub struct StateInputs {
-    pub z: [Value; 2],
-    pub h: [Value; 2],
+    pub z: Vec<Value>,
+    pub h: Vec<Value>,
 }
 
 impl Part<'_> {
@@ -95,10 +95,13 @@ impl Part<'_> {
 
     /// Declares the inputs of a part that reads the whole state.
     pub fn state_inputs(&mut self, inputs: &[rcwm_models::bundle::TensorSpec]) -> StateInputs {
-        let values: Vec<Value> = inputs.iter().map(|spec| self.graph.input(spec)).collect();
-        let [robot_z, robot_h, environment_z, environment_h] =
-            <[Value; 4]>::try_from(values).expect("parts that read the state have its four inputs");
-        StateInputs { z: [robot_z, environment_z], h: [robot_h, environment_h] }
+        let mut state = StateInputs { z: Vec::new(), h: Vec::new() };
+        for spec in inputs {
+            let value = self.graph.input(spec);
+            let of = if spec.name.ends_with("_z") { &mut state.z } else { &mut state.h };
+            of.push(value);
+        }
+        state
     }
 
     /// Two dense blocks and an output layer on the whole state.
@@ -124,18 +127,28 @@ impl Part<'_> {
         let d = self.settings.deter;
         let rows = |from, count| self.weights.rows(&weight, from, count);
         // The state is [z^R, h^R, z^E, h^E]; its z rows and its h rows are taken together.
-        let (z_rows, h_rows) = ([rows(0, nm), rows(s, nm)], [rows(nm, d), rows(s + nm, d)]);
-        let join = |rows: [Array2<f32>; 2]| {
-            concatenate(Axis(0), &[rows[0].view(), rows[1].view()]).expect("both have the head's width")
+        let join = |from: usize, count: usize| {
+            let each = (0..state.z.len()).map(|branch| rows(branch * s + from, count));
+            let each: Vec<Array2<f32>> = each.collect();
+            let views: Vec<_> = each.iter().map(|rows| rows.view()).collect();
+            concatenate(Axis(0), &views).expect("all have the head's width")
         };
-        let (z_rows, h_rows) = (join(z_rows), join(h_rows));
-        let z = self.graph.concat(&[&state.z[0], &state.z[1]], 1); // [1, 2n]
-        let h = self.graph.concat(&[&state.h[0], &state.h[1]], 1); // [1, 2d]
+        let (z_rows, h_rows) = (join(0, nm), join(nm, d));
+        let z = self.side_by_side(&state.z); // [1, branches * n]
+        let h = self.side_by_side(&state.h); // [1, branches * d]
         let z_share = self.one_hot_product(&format!("{weight}.z"), &z, z_rows);
         let h_rows = self.matrix(&format!("{weight}.h"), h_rows);
         let h_share = self.graph.matmul(&h, &h_rows);
         let sum = self.graph.add(&z_share, &h_share);
         let x = self.norm_silu(&format!("{name}.0.norm"), &sum);
         self.dense(&format!("{name}.1"), &x)
+    }
+
+    /// One value after another on the second axis.
+    fn side_by_side(&mut self, values: &[Value]) -> Value {
+        match values {
+            [one] => one.clone(),
+            several => self.graph.concat(&several.iter().collect::<Vec<_>>(), 1),
+        }
     }
 }

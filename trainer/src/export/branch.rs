@@ -1,13 +1,14 @@
-//! Robot and environment as graphs, each with its encoder.
+//! The branches as graphs, each with its encoder.
 
 use rcwm_models::bundle::{PartName, TensorSpec};
+use rcwm_models::settings::ModelKind;
 
 use super::blocks::Part;
 use super::graph::Value;
 use crate::model::layers::NORM_EPS;
 
 impl Part<'_> {
-    /// The shared encoder: image -> features.
+    /// The encoder, of RCWM the convolutions that both branches share: image -> features.
     pub fn encoder(&mut self) {
         let (inputs, _) = PartName::Encoder.signature(self.settings);
         let image = self.graph.input(&inputs[0]);
@@ -16,24 +17,41 @@ impl Part<'_> {
         let x = self.graph.binary("Div", &x, &full);
         let x = self.graph.shift(&x, -0.5);
         let x = self.graph.transpose(&x, &[0, 3, 1, 2]);
-        let features = self.conv_stack("encoder.shared", x, 2); // [1, 2c, S/4, S/4]
+        let features = match self.settings.kind {
+            ModelKind::Rcwm => self.conv_stack("encoder.shared", x, 2), // [1, 2c, S/4, S/4]
+            ModelKind::Vanilla => self.conv_stack("encoder", x, self.settings.stages()), // [1, 8c, 4, 4]
+        };
         self.graph.output("features", &features);
     }
 
     /// The robot branch (eq. 5, 6 left): z, h, action, features, noise -> h', prior and posterior.
     pub fn robot(&mut self) {
-        let (inputs, _) = PartName::Robot.signature(self.settings);
+        self.acting("robot", PartName::Robot, |part, features| {
+            let stages = part.settings.stages() - 2;
+            part.conv_stack("encoder.robot", features.clone(), stages) // [1, 4c, 4, 4]
+        });
+    }
+
+    /// The vanilla model's one branch, whose picture is encoded before: as the robot's.
+    pub fn dynamics(&mut self) {
+        self.acting("dynamics", PartName::Dynamics, |_, features| features.clone()); // [1, 8c, 4, 4]
+    }
+
+    /// A branch that takes the action and, where the model looks at it, the measured state.
+    fn acting(&mut self, name: &str, part: PartName, encode: impl Fn(&mut Self, &Value) -> Value) {
+        let (inputs, _) = part.signature(self.settings);
         let (inputs, state) = inputs.split_at(5);
         let [z, h, action, features, noise] = self.inputs(inputs);
         let state = state.first().map(|spec| self.graph.input(spec));
         let state = state.map(|state| self.measured(&state));
         let nm = self.settings.stoch_width();
-        let weight = "robot.input.linear.weight";
-        let z_share = self.one_hot_product(&format!("{weight}.z"), &z, self.weights.rows(weight, 0, nm));
+        let weight = format!("{name}.input.linear.weight");
+        let z_share = self.one_hot_product(&format!("{weight}.z"), &z, self.weights.rows(&weight, 0, nm));
         let action = self.normalised_action(&action);
-        let action_share = self.linear_share("robot.input.linear", &action, nm);
+        let action_share = self.linear_share(&format!("{name}.input.linear"), &action, nm);
         let sum = self.graph.add(&z_share, &action_share);
-        self.branch("robot", &sum, &h, &features, state.as_ref(), &noise);
+        let encode = |part: &mut Self| encode(part, &features);
+        self.branch(name, &sum, &h, encode, state.as_ref(), &noise);
     }
 
     /// The environment branch (eq. 5, 6 right): e, h, features, noise -> h', prior and posterior.
@@ -42,7 +60,11 @@ impl Part<'_> {
         let [e, h, features, noise] = self.inputs(&inputs);
         let e = self.graph.reshape(&e, &[1, self.settings.stoch_width()]);
         let sum = self.linear_share("environment.input.linear", &e, 0);
-        self.branch("environment", &sum, &h, &features, None, &noise);
+        let encode = |part: &mut Self| {
+            let stages = part.settings.stages() - 2;
+            part.conv_stack("encoder.environment", features.clone(), stages) // [1, 4c, 4, 4]
+        };
+        self.branch("environment", &sum, &h, encode, None, &noise);
     }
 
     /// Declares the inputs.
@@ -72,13 +94,13 @@ impl Part<'_> {
         self.graph.binary("Div", action, &divisor)
     }
 
-    /// What both branches do after their input layer's product.
+    /// What every branch does after its input layer's product; `encode` gives its picture's map.
     fn branch(
         &mut self,
         name: &str,
         input: &Value,
         h: &Value,
-        features: &Value,
+        encode: impl FnOnce(&mut Self) -> Value,
         state: Option<&Value>,
         noise: &Value,
     ) {
@@ -91,9 +113,8 @@ impl Part<'_> {
         let prior = self.log_probs(&format!("{name}.prior.logits"), &hidden);
         let prior_z = self.draw(&prior, &noise[0]);
 
-        let stages = self.settings.stages() - 2;
-        let embed = self.conv_stack(&format!("encoder.{name}"), features.clone(), stages); // [1, 4c, 4, 4]
-        let width = 16 * 4 * self.settings.cnn_depth;
+        let embed = encode(self);
+        let width = embed.shape().iter().product();
         let embed = self.graph.reshape(&embed, &[1, width]);
         // The share of h' needs no image, and can be ready when it comes.
         let dense = format!("{name}.posterior.dense");

@@ -2,19 +2,28 @@
 
 use ndarray::{Array2, ArrayD, IxDyn};
 use rcwm_models::bundle::PartName;
+use rcwm_models::settings::ModelKind;
 
 use super::blocks::Part;
 use super::graph::Value;
 
 impl Part<'_> {
-    /// State -> the whole picture (eq. 8), each branch's image times its mask, and the masks.
+    /// State -> the whole picture (eq. 8), each branch's image times its mask, and the masks; of the vanilla model its picture and the
+    /// robot's mask.
     pub fn decoder(&mut self) {
         let (inputs, _) = PartName::Decoder.signature(self.settings);
         let state = self.state_inputs(&inputs);
+        if self.settings.kind == ModelKind::Vanilla {
+            let (image, mask) = self.picture("decoder", &state.z[0], &state.h[0]);
+            let (image, mask) = (self.channels(image, 3), self.channels(mask, 1));
+            self.graph.output("image", &image);
+            self.graph.output("mask", &mask);
+            return;
+        }
         let mut masked = Vec::with_capacity(2);
         let mut masks = Vec::with_capacity(2);
         for (index, branch) in ["robot", "environment"].into_iter().enumerate() {
-            let (image, mask) = self.picture(branch, &state.z[index], &state.h[index]);
+            let (image, mask) = self.picture(&format!("decoder.{branch}"), &state.z[index], &state.h[index]);
             let product = self.graph.mul(&image, &mask);
             masked.push(self.channels(product, 3));
             masks.push(self.channels(mask, 1));
@@ -34,8 +43,7 @@ impl Part<'_> {
     }
 
     /// One branch's image [1, S, S * C, 3] and mask [1, S, S * C, 1]; a pixel's cameras are side by side.
-    fn picture(&mut self, branch: &str, z: &Value, h: &Value) -> (Value, Value) {
-        let name = format!("decoder.{branch}");
+    fn picture(&mut self, name: &str, z: &Value, h: &Value) -> (Value, Value) {
         let (nm, d) = (self.settings.stoch_width(), self.settings.deter);
         let channels = 8 * self.settings.cnn_depth;
         let weight = channels_first(&self.weights.matrix(&format!("{name}.linear.weight")), channels);

@@ -4,14 +4,16 @@ use std::collections::BTreeMap;
 
 use candle_core::{D, DType, Device, Tensor};
 use ndarray::{ArrayD, IxDyn};
-use rcwm_models::bundle::{InitialState, PartName};
+use rcwm_models::bundle::{InitialBranch, InitialState, PartName};
 use rcwm_models::tensors::{Tensors, Values};
 
 use super::scene::Scene;
 use super::{ExportError, Progress};
 use crate::model::agent::Agent;
+use crate::model::branch::Branch;
 use crate::model::latent::{Latent, Sampler, State};
 use crate::model::rcwm::{ENVIRONMENT, ROBOT, Rcwm};
+use crate::model::vanilla::Vanilla;
 use crate::model::world::World;
 use crate::ops;
 
@@ -33,15 +35,14 @@ pub fn record(
     progress: &dyn Progress,
 ) -> Result<Tensors, ExportError> {
     let mut recorder = Recorder { agent, parts, rows: BTreeMap::new(), sampler: Sampler::seeded(seed) };
-    let World::Rcwm(world) = &agent.world else { return Err(ExportError::Vanilla) };
-    let initial = world.initial(1)?;
+    let initial = agent.world.initial(1)?;
     let mut state = initial.clone();
     for tick in 0..scene.len() {
         progress.step("golden tick", tick, scene.len())?;
         if scene.is_first(tick) {
             state = initial.clone();
         }
-        state = recorder.tick(world, &state, scene, tick)?;
+        state = recorder.tick(&state, scene, tick)?;
     }
     recorder.finish(scene)
 }
@@ -49,15 +50,11 @@ pub fn record(
 /// The learned state an episode starts from, as the runtime keeps it.
 pub fn initial_state(agent: &Agent) -> Result<InitialState, ExportError> {
     let state = agent.world.initial(1)?;
-    let [robot, environment] = state.branches.as_slice() else { return Err(ExportError::Vanilla) };
-    let h = |latent: &Latent| latent.h.flatten_all()?.to_vec1::<f32>();
-    let z = |latent: &Latent| classes(&latent.z)?.flatten_all()?.to_vec1::<i64>();
-    Ok(InitialState {
-        robot_h: h(robot)?,
-        robot_z: z(robot)?,
-        environment_h: h(environment)?,
-        environment_z: z(environment)?,
-    })
+    let branch = |latent: &Latent| -> Result<InitialBranch, ExportError> {
+        let h = latent.h.flatten_all()?.to_vec1::<f32>()?;
+        Ok(InitialBranch { h, z: classes(&latent.z)?.flatten_all()?.to_vec1::<i64>()? })
+    };
+    Ok(InitialState { branches: state.branches.iter().map(branch).collect::<Result<_, _>>()? })
 }
 
 /// What one branch made of a tick.
@@ -76,43 +73,14 @@ struct Recorder<'a> {
 
 impl Recorder<'_> {
     /// One tick; gives the posterior state.
-    fn tick(
-        &mut self,
-        world: &Rcwm,
-        before: &State,
-        scene: &Scene,
-        tick: usize,
-    ) -> Result<State, ExportError> {
-        let image = scene.image(tick)?; // [1, S, S, 3 C]
-        let features = world.features(&image)?; // [1, S/4, S/4, 2c]
-        if tick < LARGE_TICKS {
-            self.expect(PartName::Encoder, "features", &features.permute((0, 3, 1, 2))?);
-        }
-        let robot_h = world.recur_robot(&before.branches[ROBOT], &scene.action(tick)?)?;
-        let robot = self.branch(
-            PartName::Robot,
-            world,
-            ROBOT,
-            robot_h,
-            world.embed_robot(&features, scene.state(tick)?.as_ref())?,
-        )?;
-
-        let environment = &before.branches[ENVIRONMENT];
-        let (e, attention) = world.interaction.forward(&robot.prior.z, &robot.h, &environment.z)?;
-        self.expect(PartName::Interaction, "e", &e);
-        self.expect(PartName::Interaction, "attention", &attention);
-
-        let environment_h = world.recur_environment(&e, &environment.h)?;
-        let environment = self.branch(
-            PartName::Environment,
-            world,
-            ENVIRONMENT,
-            environment_h,
-            world.embed(ENVIRONMENT, &features)?,
-        )?;
+    fn tick(&mut self, before: &State, scene: &Scene, tick: usize) -> Result<State, ExportError> {
+        let agent = self.agent;
+        let branches = match &agent.world {
+            World::Rcwm(world) => self.rcwm(world, before, scene, tick)?,
+            World::Vanilla(world) => self.vanilla(world, before, scene, tick)?,
+        };
         // One-hot rows exactly, as the runtime carries class indices.
-        let state =
-            State { branches: vec![robot.posterior, environment.posterior] }.map(|x| Ok(x.detach()))?;
+        let state = State { branches }.map(|x| Ok(x.detach()))?;
         self.heads(&state)?;
         if tick < LARGE_TICKS {
             self.pictures(&state)?;
@@ -120,16 +88,61 @@ impl Recorder<'_> {
         Ok(state)
     }
 
+    /// The posteriors of both branches.
+    fn rcwm(
+        &mut self,
+        world: &Rcwm,
+        before: &State,
+        scene: &Scene,
+        tick: usize,
+    ) -> Result<Vec<Latent>, ExportError> {
+        let features = world.features(&scene.image(tick)?)?; // [1, S/4, S/4, 2c]
+        self.features(&features, tick)?;
+        let h = world.recur_robot(&before.branches[ROBOT], &scene.action(tick)?)?;
+        let embed = world.embed_robot(&features, scene.state(tick)?.as_ref())?;
+        let robot = self.branch(PartName::Robot, &world.branches[ROBOT], h, embed)?;
+
+        let environment = &before.branches[ENVIRONMENT];
+        let (e, attention) = world.interaction.forward(&robot.prior.z, &robot.h, &environment.z)?;
+        self.expect(PartName::Interaction, "e", &e);
+        self.expect(PartName::Interaction, "attention", &attention);
+
+        let h = world.recur_environment(&e, &environment.h)?;
+        let embed = world.embed(ENVIRONMENT, &features)?;
+        let environment = self.branch(PartName::Environment, &world.branches[ENVIRONMENT], h, embed)?;
+        Ok(vec![robot.posterior, environment.posterior])
+    }
+
+    /// The posterior of the one branch.
+    fn vanilla(
+        &mut self,
+        world: &Vanilla,
+        before: &State,
+        scene: &Scene,
+        tick: usize,
+    ) -> Result<Vec<Latent>, ExportError> {
+        let features = world.features(&scene.image(tick)?)?; // [1, 4, 4, 8c]
+        self.features(&features, tick)?;
+        let h = world.recur(&before.branches[0], &scene.action(tick)?)?;
+        let embed = world.embed(&features, scene.state(tick)?.as_ref())?;
+        Ok(vec![self.branch(PartName::Dynamics, &world.branch, h, embed)?.posterior])
+    }
+
+    fn features(&mut self, features: &Tensor, tick: usize) -> Result<(), ExportError> {
+        if tick < LARGE_TICKS {
+            self.expect(PartName::Encoder, "features", &features.permute((0, 3, 1, 2))?);
+        }
+        Ok(())
+    }
+
     /// Prior and posterior of a branch whose h' is known.
     fn branch(
         &mut self,
         part: PartName,
-        world: &Rcwm,
-        index: usize,
+        branch: &Branch,
         h: Tensor,
         embed: Tensor,
     ) -> Result<Drawn, ExportError> {
-        let branch = &world.branches[index];
         let unimix = self.agent.settings.unimix;
         let share = branch.embed_share(&embed)?;
         let (prior, posterior) = (branch.prior_logits(&h)?, branch.posterior_logits(&h, &share)?);
@@ -180,6 +193,10 @@ impl Recorder<'_> {
     fn pictures(&mut self, state: &State) -> Result<(), ExportError> {
         let decoded = self.agent.world.decode(state)?;
         self.expect(PartName::Decoder, "image", &decoded.image);
+        if let World::Vanilla(_) = self.agent.world {
+            self.expect(PartName::Decoder, "mask", &decoded.pictures[0].mask);
+            return Ok(());
+        }
         for (branch, picture) in ["robot", "environment"].iter().zip(&decoded.pictures) {
             self.expect(PartName::Decoder, &format!("{branch}_image"), &picture.masked()?);
             self.expect(PartName::Decoder, &format!("{branch}_mask"), &picture.mask);

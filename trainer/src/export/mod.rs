@@ -21,9 +21,8 @@ mod weights;
 use std::path::PathBuf;
 
 use prost::Message;
-use rcwm_models::bundle::{BundleError, PartName};
+use rcwm_models::bundle::{PartName, WriteError};
 use rcwm_models::episode::{EpisodeError, Misfit};
-use rcwm_models::files::FileError;
 use rcwm_models::settings::ModelSettings;
 use rcwm_models::tensors::TensorsError;
 
@@ -35,27 +34,15 @@ use weights::Weights;
 /// Why a bundle could not be written.
 #[derive(Debug, thiserror::Error)]
 pub enum ExportError {
-    /// The vanilla baseline has no bundle format.
-    #[error("export: this checkpoint is a vanilla model; only rcwm models can be deployed")]
-    Vanilla,
     /// No golden ticks.
     #[error("export: golden values need at least one tick")]
     NoTicks,
-    /// The place is taken.
-    #[error("export: {path} is there already; choose another folder or say --force")]
-    Exists { path: PathBuf },
-    /// The place is taken by something that is no bundle, which is never replaced.
-    #[error("export: {path} is there and is no bundle; choose another folder or remove it")]
-    NotABundle { path: PathBuf },
+    /// The place is taken, or the folder could not be written; a finished bundle that does not open is a bug of this program.
+    #[error("export: {0}")]
+    Write(#[from] WriteError),
     /// The work was interrupted; nothing is left behind.
     #[error("export: interrupted; nothing was written")]
     Interrupted,
-    /// A folder could not be made, moved or removed.
-    #[error("export: {path}: {source}")]
-    Folder { path: PathBuf, source: std::io::Error },
-    /// A file could not be written.
-    #[error("export: {0}")]
-    File(#[from] FileError),
     /// The episode for the golden values is unusable.
     #[error("export: {0}")]
     Episode(#[from] EpisodeError),
@@ -67,12 +54,6 @@ pub enum ExportError {
     /// Golden values or initial state could not be written.
     #[error("export: {0}")]
     Tensors(#[from] TensorsError),
-    /// The manifest could not be written.
-    #[error("export: {0}")]
-    Manifest(#[from] toml::ser::Error),
-    /// The finished bundle does not open: a bug of this program.
-    #[error("export: the finished bundle was refused: {0}")]
-    Refused(#[from] BundleError),
     /// The weights do not fit the model.
     #[error("export: {0}")]
     Parameters(#[from] ParameterError),
@@ -99,6 +80,9 @@ fn part_to_onnx(name: PartName, weights: &Weights, settings: &ModelSettings) -> 
         PartName::Robot => part.robot(),
         PartName::Interaction => part.interaction(),
         PartName::Environment => part.environment(),
+        PartName::Dynamics => part.dynamics(),
+        // No world model is exported as one graph: `Bundle::open` refuses a part of another kind.
+        PartName::Policy => {}
         PartName::Actor => part.actor(),
         PartName::Reward => part.reward(),
         PartName::Continue => part.continues(),
@@ -110,6 +94,8 @@ fn part_to_onnx(name: PartName, weights: &Weights, settings: &ModelSettings) -> 
 fn describe(name: PartName) -> &'static str {
     match name {
         PartName::Encoder => "Shared encoder: image to features",
+        PartName::Dynamics => "The one branch: one step of the recurrence, prior and posterior",
+        PartName::Policy => "Policy",
         PartName::Robot => "Robot branch with its encoder: one step of the recurrence, prior and posterior",
         PartName::Interaction => "Cross-attention from the environment's state to the robot's prior",
         PartName::Environment => {

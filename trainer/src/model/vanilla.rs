@@ -46,11 +46,21 @@ impl Vanilla {
 
     /// The embedding [N, 16*8c] of u8 images [N, S, S, 3 C], with what the robot measured [N, state] [N, 16*8c + hidden].
     pub fn encode(&self, images: &Tensor, state: Option<&Tensor>) -> Result<Vec<Tensor>> {
-        let embed = flatten_channels_first(&self.encoder.forward(&image_to_float(images)?)?)?;
-        Ok(vec![match &self.measured {
-            Some(measured) => measured.join(&embed, state)?,
-            None => embed,
-        }])
+        Ok(vec![self.embed(&self.features(images)?, state)?])
+    }
+
+    /// Features of u8 images [N, S, S, 3 C]: [N, 4, 4, 8c].
+    pub fn features(&self, images: &Tensor) -> Result<Tensor> {
+        self.encoder.forward(&image_to_float(images)?)
+    }
+
+    /// The embedding of features [N, 4, 4, 8c] and of what the robot measured [N, state].
+    pub fn embed(&self, features: &Tensor, state: Option<&Tensor>) -> Result<Tensor> {
+        let embed = flatten_channels_first(features)?;
+        match &self.measured {
+            Some(measured) => measured.join(&embed, state),
+            None => Ok(embed),
+        }
     }
 
     /// The learned state an episode starts from.
@@ -58,7 +68,8 @@ impl Vanilla {
         Ok(State { branches: vec![self.branch.initial(batch)?] })
     }
 
-    fn recur(&self, previous: &Latent, action: &Tensor) -> Result<Tensor> {
+    /// h_t [B, d] from z_{t-1}, h_{t-1} and the action a_{t-1} [B, action].
+    pub fn recur(&self, previous: &Latent, action: &Tensor) -> Result<Tensor> {
         let x = Tensor::cat(&[&previous.z.flatten_from(1)?, &normalised_action(action)?], 1)?;
         self.branch.recur(&x, &previous.h)
     }

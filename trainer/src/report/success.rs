@@ -284,15 +284,17 @@ fn policy(folder: &Path, place: &Path) -> Result<Result<Policy, String>, ReportE
     let own = name_of(place);
     let (name, task) = if task_id(&own).is_ok() {
         // A folder that is itself a bundle has no name beside its task's.
-        (if folder == place { own.clone() } else { name_of(folder) }, own)
+        (if folder == place { own.clone() } else { name_of(folder) }, own.clone())
     } else if manifest.provenance.updates == 0 {
         return Ok(Err(format!("{own}: random weights, and its folder is not named after a task")));
     } else if task_id(&manifest.task).is_ok() {
-        (own, manifest.task)
+        (own.clone(), manifest.task)
     } else {
         return Ok(Err(format!("{own}: neither its folder nor its manifest names a task")));
     };
-    let model = manifest.model;
+    let Some(model) = manifest.model else {
+        return Ok(Err(format!("{own}: kind {} has no world model to report on", manifest.kind)));
+    };
     let data = shown_words(&manifest.provenance.data);
     let provenance = Provenance { data, ..manifest.provenance };
     Ok(Ok(Policy { name, task, folder: place.to_path_buf(), sha256, model, provenance }))

@@ -1,6 +1,6 @@
 //! A node's attributes: each read once, with its type, and none left over.
 
-use crate::onnx::{Amounts, Attribute, Node, attribute_type};
+use crate::onnx::{Amounts, Attribute, Node, Tensor, attribute_type};
 
 /// Attributes not yet read.
 pub(super) struct Attributes<'a>(Vec<&'a Attribute>);
@@ -43,6 +43,25 @@ impl<'a> Attributes<'a> {
 
     pub(super) fn float(&mut self, name: &str) -> Result<Option<f32>, String> {
         Ok(self.take(name, attribute_type::FLOAT)?.map(|attribute| attribute.f))
+    }
+
+    pub(super) fn string(&mut self, name: &str) -> Result<Option<String>, String> {
+        let found = self.take(name, attribute_type::STRING)?;
+        Ok(found.map(|attribute| String::from_utf8_lossy(&attribute.s).into_owned()))
+    }
+
+    pub(super) fn tensor(&mut self, name: &str) -> Result<Option<&'a Tensor>, String> {
+        Ok(self.take(name, attribute_type::TENSOR)?.and_then(|attribute| attribute.t.as_ref()))
+    }
+
+    /// A number that may be there, but only this one, which is also the default.
+    pub(super) fn only_int(&mut self, name: &str, expected: i64) -> Result<(), String> {
+        match self.int(name)? {
+            Some(found) if found != expected => {
+                Err(format!("attribute {name:?} is {found}, expected {expected}"))
+            }
+            _ => Ok(()),
+        }
     }
 
     /// Whether a flag is set; absent is `absent`.

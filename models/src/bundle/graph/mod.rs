@@ -9,7 +9,9 @@ mod attributes;
 mod inferred;
 mod movement;
 mod operators;
+mod policies;
 mod value;
+mod window;
 
 use std::collections::HashMap;
 
@@ -19,7 +21,7 @@ use attributes::Attributes;
 use value::Value;
 
 /// Operator sets whose operators mean what is checked here.
-const OPSETS: std::ops::RangeInclusive<i64> = 17..=18;
+const OPSETS: std::ops::RangeInclusive<i64> = 17..=21;
 
 /// What a part may hold at most, beside [`Amounts`]. The paper's largest part has 4 million elements between its nodes.
 struct Limits;
@@ -176,7 +178,13 @@ impl Walk {
 
     fn run(&mut self, node: &Node) -> Result<(), GraphError> {
         at_most("inputs of a node", node.input.len(), Amounts::NODE_INPUTS)?;
-        let inputs = node.input.iter().map(|name| self.value(name)).collect::<Result<Vec<_>, _>>()?;
+        let absent = Value::absent();
+        let may_be_absent = policies::WITH_OPTIONAL_INPUTS.contains(&node.op_type.as_str());
+        let value = |name: &String| match name.as_str() {
+            "" if may_be_absent => Ok(&absent),
+            name => self.value(name),
+        };
+        let inputs = node.input.iter().map(value).collect::<Result<Vec<_>, _>>()?;
         let failed =
             |reason| GraphError::Node { node: node.name.clone(), operator: node.op_type.clone(), reason };
         let mut attributes = Attributes::of(node).map_err(failed)?;
@@ -190,7 +198,9 @@ impl Walk {
             let (found, expected) = (node.output.len(), outputs.len());
             return Err(failed(format!("{found} outputs, expected {expected}")));
         }
-        for (name, value) in node.output.iter().zip(outputs) {
+        // One that has no name is not wanted, which only operators with several may say.
+        let unwanted = |name: &String| name.is_empty() && may_be_absent;
+        for (name, value) in node.output.iter().zip(outputs).filter(|(name, _)| !unwanted(name)) {
             value.check(Limits::RANK).map_err(failed)?;
             // Each was checked to be small: the sum of two cannot overflow.
             self.elements += value.elements().min(Limits::ELEMENTS + 1);

@@ -1,9 +1,10 @@
 //! Operators that compute: element by element, products, convolutions, reductions.
 
 use super::attributes::Attributes;
-use super::inferred::{Inferred, take};
+use super::inferred::{Inferred, broadcast, floats, reduced, take};
 use super::value::Value;
-use super::{DType, Limits, movement};
+use super::window::{Window, picture_side};
+use super::{DType, Limits, movement, policies};
 use crate::onnx::data_type;
 
 /// The outputs of an operator; none when it is not on the list. `outputs` is how many the node names.
@@ -29,16 +30,8 @@ pub(super) fn infer(
         "Reshape" => movement::reshape(inputs),
         "Split" => movement::split(attributes, inputs, outputs),
         "Transpose" => movement::transpose(attributes, inputs),
-        _ => return None,
+        _ => return policies::infer(operator, attributes, inputs, outputs),
     })
-}
-
-fn floats<'a, const N: usize>(inputs: &[&'a Value]) -> Result<[&'a Value; N], String> {
-    let inputs = take::<N>(inputs)?;
-    match inputs.iter().find(|input| input.dtype != DType::F32) {
-        None => Ok(inputs),
-        Some(other) => Err(format!("an input is {}, expected floats", other.text())),
-    }
 }
 
 fn unary(inputs: &[&Value]) -> Inferred {
@@ -71,33 +64,12 @@ fn range_of(operator: &str, a: &Value, b: &Value) -> Option<(i64, i64)> {
     }
 }
 
-fn broadcast(a: &[usize], b: &[usize]) -> Result<Vec<usize>, String> {
-    let rank = a.len().max(b.len());
-    let dim = |shape: &[usize], i: usize| (i + shape.len()).checked_sub(rank).map_or(1, |i| shape[i]);
-    (0..rank)
-        .map(|i| match (dim(a, i), dim(b, i)) {
-            (x, y) if x == y => Ok(x),
-            (1, x) | (x, 1) => Ok(x),
-            _ => Err(format!("shapes {a:?} and {b:?} do not go together")),
-        })
-        .collect()
-}
-
 fn arg_max(attributes: &mut Attributes<'_>, inputs: &[&Value]) -> Inferred {
     let [x] = floats(inputs)?;
     let axis = attributes.axis(0, x.rank())?;
     let keep = attributes.flag("keepdims", true)?;
     let range = Some((0, x.shape[axis] as i64 - 1));
     Ok(vec![Value { range, ..Value::new(DType::I64, reduced(&x.shape, &[axis], keep)) }])
-}
-
-fn reduced(shape: &[usize], axes: &[usize], keep: bool) -> Vec<usize> {
-    let each = shape.iter().enumerate();
-    if keep {
-        each.map(|(i, dim)| if axes.contains(&i) { 1 } else { *dim }).collect()
-    } else {
-        each.filter(|(i, _)| !axes.contains(i)).map(|(_, dim)| *dim).collect()
-    }
 }
 
 fn cast(attributes: &mut Attributes<'_>, inputs: &[&Value]) -> Inferred {
@@ -166,39 +138,6 @@ fn softmax(attributes: &mut Attributes<'_>, inputs: &[&Value]) -> Inferred {
     Ok(vec![Value::new(DType::F32, x.shape.clone())])
 }
 
-/// Two dimensions, as every convolution here: kernel, strides and pads.
-struct Window {
-    kernel: [usize; 2],
-    strides: [usize; 2],
-    /// Added (or cut) at both ends together.
-    pads: [usize; 2],
-}
-
-impl Window {
-    fn read(attributes: &mut Attributes<'_>, kernel: [usize; 2]) -> Result<Self, String> {
-        let as_i64 = kernel.map(|side| side as i64);
-        attributes.only("kernel_shape", &as_i64)?;
-        attributes.only("dilations", &[1, 1])?;
-        if let Some(group) = attributes.int("group")?.filter(|group| *group != 1) {
-            return Err(format!("group is {group}, expected 1"));
-        }
-        let strides = small(attributes.ints("strides")?.unwrap_or(&[1, 1]), 1, 64)?;
-        let pads: [usize; 4] = small(attributes.ints("pads")?.unwrap_or(&[0; 4]), 0, 64)?;
-        let ends = [0, 1].map(|i| (pads[i], pads[i + 2], kernel[i]));
-        if ends.iter().any(|(begin, end, side)| begin >= side || end >= side) {
-            return Err(format!("pads {pads:?} are not smaller than the kernel {kernel:?}"));
-        }
-        Ok(Self { kernel, strides, pads: ends.map(|(begin, end, _)| begin + end) })
-    }
-}
-
-fn small<const N: usize>(found: &[i64], min: usize, max: usize) -> Result<[usize; N], String> {
-    let sized: Option<Vec<usize>> = found.iter().map(|x| usize::try_from(*x).ok()).collect();
-    let fits = sized.filter(|sized| sized.iter().all(|x| (min..=max).contains(x)));
-    fits.and_then(|sized| sized.try_into().ok())
-        .ok_or_else(|| format!("numbers {found:?}, expected {N} from {min} to {max}"))
-}
-
 /// Shapes that enter a convolution.
 struct Picture<'a> {
     /// `[N, C, H, W]`.
@@ -252,12 +191,7 @@ fn conv(attributes: &mut Attributes<'_>, inputs: &[&Value]) -> Inferred {
     let Picture { x: [n, c, height, width], kernel: [to, from, h, w], bias } = picture(inputs)?;
     check_channels(c, from, bias, to)?;
     let window = Window::read(attributes, [h, w])?;
-    let side = |i: usize, len: usize| -> Result<usize, String> {
-        let covered = len.checked_add(window.pads[i]).and_then(|len| len.checked_sub(window.kernel[i]));
-        let covered = covered.ok_or_else(|| format!("kernel {:?} on {height} x {width}", window.kernel))?;
-        Ok(covered / window.strides[i] + 1)
-    };
-    let (height, width) = (side(0, height)?, side(1, width)?);
+    let (height, width) = (picture_side(&window, 0, height)?, picture_side(&window, 1, width)?);
     check_unfolded([c, h, w, height, width])?;
     Ok(vec![Value::new(DType::F32, vec![n, to, height, width])])
 }

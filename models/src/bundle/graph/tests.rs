@@ -142,3 +142,80 @@ fn another_operator_set_is_refused() {
     model.opset_import[0].version = 11;
     assert!(matches!(check_lookup(&model).unwrap_err(), GraphError::OperatorSet { .. }));
 }
+
+/// One node on one constant weight; what is known of its output.
+fn one(
+    operator: &str,
+    x: &[usize],
+    w: &[usize],
+    out: &[usize],
+    attribute: Vec<Attribute>,
+) -> Result<(), GraphError> {
+    let graph = Graph {
+        node: vec![node(operator, &["x", "w"], "out", attribute)],
+        initializer: vec![Tensor::f32("w", w, &vec![0.5; w.iter().product()])],
+        ..Graph::default()
+    };
+    let opset_import = vec![OperatorSet { domain: String::new(), version: 17 }];
+    let model = Model { graph: Some(graph), opset_import, ..Model::default() };
+    let inputs = [TensorSpec::new("x", DType::F32, x)];
+    check(&model, &inputs, &[TensorSpec::new("out", DType::F32, out)], 0)
+}
+
+#[test]
+fn a_matrix_that_is_turned_multiplies_by_its_columns() {
+    one("Gemm", &[1, 3], &[4, 3], &[1, 4], vec![int("transB", 1)]).unwrap();
+    one("Gemm", &[1, 3], &[3, 4], &[1, 4], vec![]).unwrap();
+    for (x, w, out) in [([1, 3], [4, 3], [1, 4]), ([1, 3], [3, 4], [1, 5])] {
+        assert!(one("Gemm", &x, &w, &out, vec![]).is_err());
+    }
+}
+
+/// An LSTM of 2 numbers in and `hidden` out, whose weights are for 4, of these inputs.
+fn lstm(hidden: i64, inputs: &[&str], attributes: Vec<Attribute>) -> Result<(), GraphError> {
+    let hidden_size = [vec![int("hidden_size", hidden)], attributes].concat();
+    let mut cell = node("LSTM", inputs, "", hidden_size);
+    cell.output = ["", "h", "c"].map(str::to_owned).to_vec();
+    let graph = Graph {
+        node: vec![cell],
+        initializer: vec![
+            Tensor::f32("w", &[1, 16, 2], &[0.1; 32]),
+            Tensor::f32("r", &[1, 16, 4], &[0.1; 64]),
+            Tensor::i64("lengths", &[1], &[1]),
+        ],
+        ..Graph::default()
+    };
+    let opset_import = vec![OperatorSet { domain: String::new(), version: 17 }];
+    let model = Model { graph: Some(graph), opset_import, ..Model::default() };
+    let carried = |name: &str| TensorSpec::new(name, DType::F32, &[1, 1, 4]);
+    let inputs = [TensorSpec::new("x", DType::F32, &[1, 1, 2]), carried("h0"), carried("c0")];
+    check(&model, &inputs, &[carried("h"), carried("c")], 0)
+}
+
+#[test]
+fn a_cell_may_leave_out_what_is_optional_and_nothing_else() {
+    lstm(4, &["x", "w", "r", "", "", "h0", "c0"], vec![]).unwrap();
+    lstm(4, &["x", "w", "r"], vec![]).unwrap();
+    for inputs in [
+        &["x", "", "r"][..],
+        &["x", "w", "r", "", "lengths"],
+        &["x", "w", "r", "", "", "w", "c0"],
+        &["x", "w", "h0"],
+        &["x", "w", "r", "", "", "h0", "c0", "r"],
+    ] {
+        assert!(matches!(lstm(4, inputs, vec![]), Err(GraphError::Node { .. })), "{inputs:?}");
+    }
+    for hidden in [0, 3, -4, i64::MAX] {
+        assert!(lstm(hidden, &["x", "w", "r"], vec![]).is_err(), "{hidden}");
+    }
+    let direction = Attribute {
+        name: "direction".into(),
+        s: b"reverse".to_vec(),
+        r#type: attribute_type::STRING,
+        ..Attribute::default()
+    };
+    assert!(lstm(4, &["x", "w", "r"], vec![direction]).is_err());
+    // An input that is left out is no scalar of another operator.
+    let absent = changed(|graph| graph.node[0].input[1].clear());
+    assert!(matches!(absent, Err(GraphError::Name { .. })));
+}

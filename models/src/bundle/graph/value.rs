@@ -17,11 +17,18 @@ pub(super) struct Value {
     pub(super) integers: Option<Vec<i64>>,
     /// It does not depend on any input.
     pub(super) is_constant: bool,
+    /// An optional input that was left out.
+    pub(super) is_absent: bool,
 }
 
 impl Value {
     pub(super) fn new(dtype: DType, shape: Vec<usize>) -> Self {
-        Self { dtype, shape, range: None, integers: None, is_constant: false }
+        Self { dtype, shape, range: None, integers: None, is_constant: false, is_absent: false }
+    }
+
+    /// An optional input that was left out.
+    pub(super) fn absent() -> Self {
+        Self { is_absent: true, ..Self::new(DType::F32, Vec::new()) }
     }
 
     /// A value like this one, in another shape.
@@ -40,6 +47,9 @@ impl Value {
             shape.collect::<Option<_>>().ok_or_else(|| format!("has shape {:?}", tensor.dims))?;
         let mut value = Self { is_constant: true, ..Self::new(dtype, shape) };
         value.check(rank_max)?;
+        if tensor.raw_data.is_empty() {
+            return Err("has its numbers elsewhere than in raw_data; write them there (onnx.numpy_helper.from_array does)".into());
+        }
         if value.elements().checked_mul(bytes) != Some(tensor.raw_data.len()) {
             let found = tensor.raw_data.len();
             return Err(format!("holds {found} bytes, its type and shape are {}", value.text()));

@@ -17,7 +17,6 @@ pub use report::{BenchReport, CaseBench, Step};
 use std::time::{Duration, Instant};
 
 use rcwm_models::bundle::Bundle;
-use rcwm_models::tensors::TensorsError;
 use rcwm_models::wire::ActionValues;
 
 use crate::inspect::{Cost, CostError, InspectError, inspect};
@@ -27,6 +26,7 @@ use rcwm_runtime::engine::EngineSettings;
 use rcwm_runtime::policy::{Inputs, Policy, PolicyError, Sampling};
 use rcwm_runtime::realtime;
 use rcwm_runtime::telemetry::{LatencyFiles, Stage, Telemetry};
+use rcwm_runtime::verify::{Golden, VerifyError};
 
 use ablation::SINGLE;
 use control::Control;
@@ -41,8 +41,8 @@ pub enum BenchError {
     #[error(transparent)]
     Policy(#[from] PolicyError),
     /// The golden images are unusable.
-    #[error("golden values: {0}")]
-    Golden(#[from] TensorsError),
+    #[error(transparent)]
+    Golden(#[from] VerifyError),
     /// The cost of a tick is unknown.
     #[error(transparent)]
     Inspect(#[from] InspectError),
@@ -84,14 +84,8 @@ pub fn bench(
     let mut runners = cases.iter().map(|case| Runner::new(bundle, *case)).collect::<Result<Vec<_>, _>>()?;
     let granted = real_time.and_then(realtime::ask);
     let stalls = measure_stalls();
-    let images = bundle.golden.u8("input/image")?;
-    let count = images.shape().first().copied().unwrap_or(0);
-    let images = images.as_slice().filter(|_| count > 0);
-    let images = images.ok_or(TensorsError::Missing { name: "input/image, at least one tick".into() })?;
-    let image_len = images.len() / count;
-    let state_len = bundle.manifest.model.state;
-    let states = if state_len == 0 { None } else { bundle.golden.f32("input/state")?.as_slice() };
-    let states = states.filter(|states| states.len() == count * state_len);
+    let golden = Golden::of(bundle)?;
+    let count = golden.ticks;
     let warm_up = (ticks / 10).min(WARM_UP_MAX);
     let mut controls = Vec::new();
     let mut measured = 0;
@@ -102,9 +96,7 @@ pub fn bench(
             // Threads that have begun only now.
             let _ = real_time.map(realtime::ask_for_helpers);
         }
-        let image = &images[round % count * image_len..][..image_len];
-        let state = states.map_or(&[][..], |states| &states[round % count * state_len..][..state_len]);
-        let inputs = Inputs { image, state };
+        let inputs = golden.inputs(round % count)?;
         for turn in 0..runners.len() {
             let index = (round + turn) % cases.len();
             runners[index].tick(inputs, round % count == 0, round >= warm_up)?;

@@ -4,7 +4,7 @@ use std::path::PathBuf;
 use std::sync::atomic::Ordering;
 
 use clap::Args;
-
+use rcwm_models::bundle::BundleKind;
 use rcwm_runtime::cli::shared::{self, EngineChoice};
 use rcwm_runtime::realtime::Request;
 use rcwm_runtime::telemetry::LatencyFiles;
@@ -45,6 +45,11 @@ pub(super) fn run(arguments: &BenchArguments) -> anyhow::Result<()> {
     let (kinds, left_out) = arguments.engine.engines()?;
     let mut cases = crate::bench::engines(&kinds);
     if arguments.ablation {
+        if bundle.manifest.kind == BundleKind::Recurrent {
+            anyhow::bail!(
+                "--ablation: a policy of kind recurrent runs as it is, there is nothing to leave out"
+            );
+        }
         cases = crate::bench::ablation();
     }
     let stop = shared::stop_flag()?;

@@ -1,6 +1,7 @@
 //! The command line. Exit codes are those of rcwm-runtime: 0 done, 1 an error, or a replay that differs, 2 usage, 130 second Ctrl-C.
 
 mod bench;
+mod bundle;
 mod film;
 mod inspect;
 mod plot;
@@ -24,6 +25,7 @@ struct Arguments {
 const EXAMPLES: &str = "\
 Examples:
   rcwm-lab inspect --bundle models/bundles/hammer
+  rcwm-lab bundle --onnx policy.onnx --interface models/src/interface/arm.toml --out bundles/policy
   rcwm-lab bench --bundle models/bundles/hammer --engine all --ticks 2000
   rcwm-lab replay --log runs/demo.rcwmlog --bundle models/bundles/hammer
   rcwm-lab film --log runs/demo.rcwmlog --bundle models/bundles/hammer --out runs/demo
@@ -38,6 +40,8 @@ Environment:
 enum Verb {
     /// Shows parts, shapes, sizes, operators, and what a tick costs
     Inspect(inspect::InspectArguments),
+    /// Makes a bundle of an ONNX policy of any library, for a robot
+    Bundle(bundle::BundleArguments),
     /// Measures the tick's latency on this machine
     Bench(bench::BenchArguments),
     /// Makes a logged run's decisions again and compares them bit for bit; turns a log into episodes
@@ -56,6 +60,7 @@ pub fn main() -> ExitCode {
     rcwm_runtime::realtime::keep_memory();
     let result = match Arguments::parse().verb {
         Verb::Inspect(arguments) => inspect::run(&arguments),
+        Verb::Bundle(arguments) => bundle::run(&arguments),
         Verb::Bench(arguments) => bench::run(&arguments),
         Verb::Replay(arguments) => replay::run(&arguments),
         Verb::Film(arguments) => film::run(&arguments),

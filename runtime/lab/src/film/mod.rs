@@ -16,7 +16,7 @@ mod panels;
 
 use std::path::{Path, PathBuf};
 
-use rcwm_models::bundle::{Manifest, PartName};
+use rcwm_models::bundle::{BundleKind, Manifest, PartName};
 use rcwm_models::files::FileError;
 use rcwm_models::interface::Camera;
 use rcwm_models::lock::{Lock, LockError};
@@ -24,7 +24,6 @@ use rcwm_models::wire::{Observation, ObservationFlags};
 use rcwm_runtime::controller::EpisodeResult;
 use rcwm_runtime::engine::{self, EngineError, Input, Output, Part};
 use rcwm_runtime::log::{Entry, LogError, LogReader, LoggedTick};
-use rcwm_runtime::policy::State;
 use serde::Serialize;
 
 use crate::log::{LoggedEpisode, ReplayError, Replayer};
@@ -168,9 +167,11 @@ impl<'a> Filming<'a> {
         let Some(replayer) = &self.replayer else { return Ok(()) };
         let bundle = replayer.bundle();
         self.decoder = None;
-        if bundle.part(PartName::Decoder).is_some() {
+        // What is drawn is what two branches see.
+        let draws = bundle.manifest.kind == BundleKind::Rcwm && bundle.part(PartName::Decoder).is_some();
+        if let (Some(model), true) = (&bundle.manifest.model, draws) {
             let decoder = engine::load(bundle, PartName::Decoder, replayer.engine())?;
-            self.decoder = Some((decoder, Decoded::of(&bundle.manifest.model)));
+            self.decoder = Some((decoder, Decoded::of(model)));
         }
         Ok(())
     }
@@ -261,7 +262,7 @@ impl<'a> Filming<'a> {
         let (Some((decoder, decoded)), Some(replayer)) = (&mut self.decoder, &self.replayer) else {
             return Ok(());
         };
-        let State { robot, environment } = replayer.policy().state();
+        let [robot, environment] = replayer.policy().state().branches.as_slice() else { return Ok(()) };
         let inputs = [
             Input::I64(&robot.z),
             Input::F32(&robot.h),

@@ -37,7 +37,7 @@ pub struct BundleInfo {
     pub golden_ticks: usize,
     /// Parts, in the order they run.
     pub parts: Vec<PartInfo>,
-    /// Cost of a tick: the five parts that run in each.
+    /// Cost of a tick: the parts that run in each.
     pub tick: Cost,
 }
 
@@ -53,7 +53,7 @@ pub fn inspect(bundle: &Bundle) -> Result<BundleInfo, InspectError> {
         let cost = Cost::of(bytes).map_err(|source| InspectError { part, source })?;
         parts.push(PartInfo {
             part,
-            in_tick: PartName::REQUIRED.contains(&part),
+            in_tick: bundle.manifest.kind.parts().contains(&part),
             file_bytes: entry.bytes,
             inputs: entry.inputs.clone(),
             outputs: entry.outputs.clone(),
@@ -74,24 +74,32 @@ impl BundleInfo {
     }
 
     fn heading(&self) -> String {
-        let Manifest { task, model, interface, provenance, .. } = &self.manifest;
+        let Manifest { task, kind, model, interface, provenance, .. } = &self.manifest;
         let limits = self.manifest.limits();
+        let model = model.as_ref().map_or_else(
+            || "one graph, no world model".to_owned(),
+            |model| {
+                format!(
+                    "{} preset: {} categoricals of {} classes, deterministic width {}, cnn depth {}, hidden {}, units {}",
+                    provenance.preset,
+                    model.categoricals,
+                    model.classes,
+                    model.deter,
+                    model.cnn_depth,
+                    model.hidden,
+                    model.units
+                )
+            },
+        );
         format!(
             "task       {task}, robot {} at {} Hz, actions {:?} to {:?}\n\
-             model      {} preset: {} categoricals of {} classes, deterministic width {}, cnn depth {}, hidden {}, units {}\n\
+             model      {kind}, {model}\n\
              origin     {}; {} updates, seeds {:?}, source {}\n\
              golden     {} ticks\n",
             interface.name,
             interface.rate_hz,
             limits.low,
             limits.high,
-            provenance.preset,
-            model.categoricals,
-            model.classes,
-            model.deter,
-            model.cnn_depth,
-            model.hidden,
-            model.units,
             provenance.data,
             provenance.updates,
             provenance.seeds,

@@ -68,7 +68,7 @@ impl Replayer {
             bundles,
             running,
             filter: SafetyFilter::new(policy.limits(), header.rate_max),
-            inputs: InputReader::of(&policy.manifest().policy),
+            inputs: InputReader::of(policy.manifest()),
             policy,
             telemetry: Telemetry::new(),
             report,
@@ -147,7 +147,7 @@ impl Replayer {
         (self.running, self.policy) = load(&self.bundles, identity, &self.report.log, self.engine)?;
         self.states.clear();
         self.filter.take_limits(self.policy.limits());
-        self.inputs = InputReader::of(&self.policy.manifest().policy);
+        self.inputs = InputReader::of(self.policy.manifest());
         self.report.swaps += 1;
         Ok(())
     }
@@ -291,7 +291,7 @@ impl Replayer {
             self.report.action_error_max = self.report.action_error_max.max((logged - replayed).abs());
         }
         let bits = |values: &[f32]| values.iter().map(|value| value.to_bits()).collect::<Vec<_>>();
-        let surprise_bits = |surprise: &Option<Surprise>| surprise.map(|s| bits(&[s.robot, s.environment]));
+        let surprise_bits = |surprise: &Option<Surprise>| surprise.map(Surprise::to_bits);
         if bits(action) != bits(a) {
             return Some(["the action".into(), format!("{action:?}"), format!("{a:?}")]);
         }
@@ -309,7 +309,9 @@ impl Replayer {
         let (fallback, logged) = (self.report.log.fallback, record.answer.action);
         self.executed(tick);
         let of_policy = [ActionSource::Policy as u32, ActionSource::Imagined as u32];
-        let action = if of_policy.contains(&record.answer.source) {
+        // What a policy without a world model holds where nothing came is its decision, too.
+        let held = tick.observation.is_none() && self.decided.is_some();
+        let action = if of_policy.contains(&record.answer.source) || held {
             self.decided
         } else {
             self.filter.fallback(fallback)

@@ -26,8 +26,13 @@ pub(super) fn flatten_channels_last(graph: &mut Graph) {
         }
         let [flat, weight] = graph.inputs(index) else { return None };
         let reshape = graph.absorbable(index, flat, "Reshape")?;
-        let transpose = graph.absorbable(reshape, graph.inputs(reshape).first()?, "Transpose")?;
-        if !graph.is_row(flat) || !is_transposition(&graph.nodes[transpose].node, false) {
+        // Of whichever part: a view moves nothing, wherever it is taken.
+        let turned = graph.inputs(reshape).first()?;
+        let transpose = graph.producer(turned).filter(|_| graph.uses(turned) == 1)?;
+        if !graph.is_row(flat)
+            || !is_transposition(&graph.nodes[transpose].node, false)
+            || graph.nodes[transpose].late != graph.nodes[reshape].late
+        {
             return None;
         }
         let pixels = graph.inputs(transpose).first()?.clone();

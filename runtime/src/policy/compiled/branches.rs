@@ -1,4 +1,4 @@
-//! The posteriors of the two branches: one after the other, or side by side on two threads.
+//! The posteriors of the branches: one after the other, or two side by side on two threads.
 //!
 //! The helper has the environment's, on memory of its own. If it is late, for whatever reason the machine has, the caller does not wait: it
 //! runs the environment's itself on a spare and goes on with what that gives, which is the same to the last bit. A tick is then about as
@@ -27,19 +27,16 @@ type Results = TractResult<TVec<TValue>>;
 type Brought = (Results, u64);
 
 pub(super) enum Branches {
-    Alone([Piece; 2]),
-    Beside(Beside),
+    Alone(Vec<Piece>),
+    Beside(Box<Beside>),
 }
 
 impl Branches {
-    pub(super) fn new(
-        robot: Piece,
-        environment: Piece,
-        team: Option<&SharedTeam>,
-    ) -> Result<Self, PolicyError> {
-        Ok(match team {
-            None => Self::Alone([robot, environment]),
-            Some(team) => Self::Beside(Beside::new(robot, environment, team)?),
+    pub(super) fn new(pieces: Vec<Piece>, team: Option<&SharedTeam>) -> Result<Self, PolicyError> {
+        let Some(team) = team else { return Ok(Self::Alone(pieces)) };
+        Ok(match <[Piece; 2]>::try_from(pieces) {
+            Ok([robot, environment]) => Self::Beside(Box::new(Beside::new(robot, environment, team)?)),
+            Err(pieces) => Self::Alone(pieces),
         })
     }
 
@@ -63,7 +60,8 @@ impl Branches {
         values: &mut Values,
         clock: &mut StageClock,
     ) -> Result<(), RunError> {
-        if let Self::Beside(Beside { spare, spare_is_new, .. }) = self
+        if let Self::Beside(beside) = self
+            && let Beside { spare, spare_is_new, .. } = &mut **beside
             && std::mem::take(spare_is_new)
         {
             // Its memory is there before it is needed.

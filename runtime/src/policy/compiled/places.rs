@@ -1,6 +1,6 @@
 //! Where a tick's inputs and outputs lie among the values: found by name once, when a bundle is loaded.
 
-use rcwm_models::bundle::PartName;
+use rcwm_models::bundle::{BundleKind, PartName};
 
 use super::pieces::{Piece, Place, Values};
 use crate::compile::{CompileError, inputs};
@@ -10,10 +10,10 @@ pub(super) struct Places {
     pub(super) image: Option<Place>,
     pub(super) state: Option<Place>,
     pub(super) action: Option<Place>,
-    pub(super) robot: BranchPlaces,
-    pub(super) environment: BranchPlaces,
-    pub(super) e: Place,
-    pub(super) attention: Place,
+    /// In the order of [`super::Buffers::branches`].
+    pub(super) branches: Vec<BranchPlaces>,
+    /// What the interaction gives, where there is one: e and its attention.
+    pub(super) interaction: Option<[Place; 2]>,
     pub(super) mean: Place,
     pub(super) std: Place,
 }
@@ -31,31 +31,26 @@ pub(super) struct BranchPlaces {
 
 impl Places {
     /// Of a tick of which `early` runs before the image is there.
-    pub(super) fn of(values: &Values, early: &[Piece]) -> Result<Self, CompileError> {
+    pub(super) fn of(kind: BundleKind, values: &Values, early: &[Piece]) -> Result<Self, CompileError> {
         let output = |part, name: &str| output(values, part, name);
-        let robot = [inputs::ROBOT_Z, inputs::ROBOT_H, inputs::ROBOT_NOISE];
-        let environment = [inputs::ENVIRONMENT_Z, inputs::ENVIRONMENT_H, inputs::ENVIRONMENT_NOISE];
+        let interaction = || -> Result<_, CompileError> {
+            Ok([output(PartName::Interaction, "e")?, output(PartName::Interaction, "attention")?])
+        };
+        let branch = |part: &PartName| BranchPlaces::of(values, *part, early);
         Ok(Self {
             image: values.find(inputs::IMAGE),
             state: values.find(inputs::STATE),
             action: values.find(inputs::ACTION),
-            robot: BranchPlaces::of(values, PartName::Robot, robot, early)?,
-            environment: BranchPlaces::of(values, PartName::Environment, environment, early)?,
-            e: output(PartName::Interaction, "e")?,
-            attention: output(PartName::Interaction, "attention")?,
+            branches: kind.branches().iter().map(branch).collect::<Result<_, _>>()?,
+            interaction: (kind == BundleKind::Rcwm).then(interaction).transpose()?,
             mean: output(PartName::Actor, "mean")?,
             std: output(PartName::Actor, "std")?,
         })
     }
-
-    /// Both branches by name, in the order of [`super::Buffers::branches`].
-    pub(super) fn branches(&self) -> [&BranchPlaces; 2] {
-        [&self.robot, &self.environment]
-    }
 }
 
 impl BranchPlaces {
-    fn of(values: &Values, part: PartName, inputs: [&str; 3], early: &[Piece]) -> Result<Self, CompileError> {
+    fn of(values: &Values, part: PartName, early: &[Piece]) -> Result<Self, CompileError> {
         let prior = |name| {
             let place = output(values, part, name)?;
             if early.iter().any(|piece| piece.makes(place)) {
@@ -64,7 +59,7 @@ impl BranchPlaces {
             let reason = format!("{part}/{name} depends on the image; a prior must not");
             Err(CompileError::Part { part, reason })
         };
-        let [z, h, noise] = inputs.map(|name| values.find(name));
+        let [z, h, noise] = ["z", "h", "noise"].map(|name| values.find(&inputs::of_branch(part, name)));
         Ok(Self {
             z,
             h,

@@ -171,8 +171,13 @@ fn policy<'a>(bundles: &'a Bundles, setup: &Setup) -> anyhow::Result<(&'a Choice
 
 fn swapper(link: &LinkSettings, setup: &Setup, policy: &Policy) -> anyhow::Result<Swapper> {
     let interface = policy.manifest().interface.clone();
-    let settings =
-        SwapSettings { link: link.clone(), engine: engine(), sampling: sampling(setup), interface };
+    let settings = SwapSettings {
+        link: link.clone(),
+        engine: engine(),
+        sampling: sampling(setup),
+        interface,
+        surprise: setup.surprise,
+    };
     Ok(Swapper::start(settings)?)
 }
 

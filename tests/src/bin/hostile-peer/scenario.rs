@@ -140,6 +140,7 @@ fn setup(rng: &mut ChaCha8Rng, bundles: usize) -> Setup {
         surprise: SurpriseLimits {
             robot_max: surprise.then(|| any(rng, &nats)).flatten(),
             environment_max: surprise.then(|| any(rng, &nats)).flatten(),
+            dynamics_max: None,
         },
         stay: rng.random_bool(0.9),
         episodes_max: rng.random_bool(0.05).then(|| rng.random_range(1..20)),

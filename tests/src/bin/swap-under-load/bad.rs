@@ -76,6 +76,6 @@ fn miss_golden(bundle: &Bundle, to: &Path, manifest: &mut Manifest) -> anyhow::R
 }
 
 fn grow(_: &Bundle, _: &Path, manifest: &mut Manifest) -> anyhow::Result<()> {
-    manifest.model.deter *= 2;
+    manifest.model.as_mut().context("a world model")?.deter *= 2;
     Ok(())
 }

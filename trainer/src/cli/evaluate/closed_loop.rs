@@ -65,20 +65,14 @@ impl Evaluate {
     pub(super) fn deployed(&self, checkpoint: &Path, folder: &Path, stop: &AtomicBool) -> Result<Deployed> {
         let checkpoint = Checkpoint::read(checkpoint, &Device::Cpu)?;
         check_acting(&checkpoint.settings.model, true)?;
-        let vanilla = checkpoint.settings.model.kind == ModelKind::Vanilla;
-        if vanilla && self.engine != TRAINER_ENGINE {
-            rcwm_models::errln!(
-                "evaluate: no runtime deploys a vanilla model; --engine trainer takes its place"
-            );
-        }
-        if vanilla || self.engine == TRAINER_ENGINE {
+        if self.engine == TRAINER_ENGINE {
             return Ok(Deployed::Here(Box::new(checkpoint)));
         }
         let place = folder.join("bundle");
         let options = Options {
             task: self.tasks.first().cloned().unwrap_or_default(),
             interface: Interface::metaworld(),
-            parts: PartName::REQUIRED.to_vec(),
+            parts: BundleKind::of(checkpoint.settings.model.kind).parts().to_vec(),
             golden_episode: None,
             golden_ticks: 1,
             golden_seed: 0,
