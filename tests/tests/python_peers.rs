@@ -177,3 +177,33 @@ fn an_episode_of_the_python_package_has_its_actions_from_limit_to_limit() {
     assert_eq!(episode.proprio.unwrap().row(1).to_vec(), [0.1, 0.2]);
     assert!(episode.success[1] && episode.robot_mask.unwrap().iter().all(|pixel| *pixel));
 }
+
+#[test]
+fn a_robot_of_one_s_own_in_python_is_driven_by_a_policy_for_its_interface() {
+    let (domain, folder) = (Domain::new(), tempfile::tempdir().unwrap());
+    let (model, bundle, json) =
+        (folder.path().join("model"), folder.path().join("bundle"), folder.path().join("run.json"));
+    let examples = root().join("runtime/python/examples");
+    let mut init = domain.command("rcwm-trainer");
+    init.args(["init", "--preset", "debug", "--set", "model.action=2", "--set", "model.state=2", "--out"]);
+    init.arg(&model);
+    Running::start(init).succeed();
+    let mut export = domain.command("rcwm-trainer");
+    export.args(["export", "--parts", "required", "--interface"]).arg(examples.join("table.toml"));
+    export.arg("--checkpoint").arg(&model).arg("--out").arg(&bundle);
+    Running::start(export).succeed();
+    let mut command = domain.command("rcwm-runtime");
+    command.args(["run", "--instance", "mine", "--bundle"]).arg(&bundle).arg("--json").arg(&json);
+    let mut runtime = Running::start(command);
+    let mut robot: Command = domain.python(&examples.join("robot.py"));
+    robot.args(["--instance", "mine", "--episodes", "2"]).env("PYTHONPATH", root().join("runtime/python/src"));
+    let told = output(robot);
+    assert!(told.status.success(), "{}", String::from_utf8_lossy(&told.stderr));
+    let counts: serde_json::Value = serde_json::from_slice(&told.stdout).unwrap();
+    assert_eq!((&counts["episodes"], &counts["observations"]), (&2.into(), &102.into()), "{counts}");
+    assert_eq!((&counts["rests"], &counts["refused_out_of_limits"]), (&0.into(), &0.into()), "{counts}");
+    runtime.succeed();
+    let run = read_json(&json);
+    assert_eq!((&run["whole_episodes"], &run["counters"]["fallback_answers"]), (&2.into(), &0.into()));
+    assert_eq!(domain.leftovers(), Vec::<String>::new());
+}
