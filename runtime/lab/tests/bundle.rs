@@ -234,22 +234,30 @@ fn a_bundle_is_replaced_only_when_asked_for() {
 /// implementation's, which is written in Python.
 #[test]
 fn an_lstm_of_another_library_becomes_a_bundle_that_gives_that_librarys_numbers() {
-    let folder = tempfile::tempdir().unwrap();
     let root = Path::new(env!("CARGO_MANIFEST_DIR")).join("../..");
-    let mut make = Command::new(root.join(".venv/bin/python"));
-    make.arg(root.join("tests/python/make_policy.py")).arg(folder.path());
-    assert!(make.status().unwrap().success());
     let pair = |from: &str, to: &str| (from.to_owned(), to.to_owned());
-    let request = Request {
-        rename: vec![pair("obs", "state"), pair("actions", "action")],
-        carry: vec![pair("h_in", "h_out"), pair("c_in", "c_out")],
-        golden: Some(folder.path().join("golden.safetensors")),
-        ..request(folder.path().join("lstm.onnx"))
-    };
-    let bundle = build(&request, &folder.path().join("bundle")).unwrap();
-    assert_eq!(bundle.manifest.policy.inputs, ["joint_pos", "arm_vel", "finger_vel"]);
-    for engine in engines() {
-        let report = verify(&bundle, engine, 1e-5, &mut || {}).unwrap();
-        assert!(report.failures.is_empty(), "{:?}", report.failures);
+    for picture in [false, true] {
+        let folder = tempfile::tempdir().unwrap();
+        let mut make = Command::new(root.join(".venv/bin/python"));
+        make.arg(root.join("tests/python/make_policy.py")).arg(folder.path());
+        assert!(make.args(picture.then_some("--picture")).status().unwrap().success());
+        let mut rename = vec![pair("obs", "state"), pair("actions", "action")];
+        rename.extend(picture.then(|| pair("camera", "image")));
+        let request = Request {
+            rename,
+            carry: vec![pair("h_in", "h_out"), pair("c_in", "c_out")],
+            golden: Some(folder.path().join("golden.safetensors")),
+            ..request(folder.path().join("lstm.onnx"))
+        };
+        let bundle = build(&request, &folder.path().join("bundle")).unwrap();
+        let states = ["joint_pos", "arm_vel", "finger_vel"];
+        assert_eq!(
+            bundle.manifest.policy.inputs,
+            [if picture { &["image"][..] } else { &[] }, &states].concat()
+        );
+        for engine in engines() {
+            let report = verify(&bundle, engine, 1e-5, &mut || {}).unwrap();
+            assert!(report.failures.is_empty(), "{:?}", report.failures);
+        }
     }
 }

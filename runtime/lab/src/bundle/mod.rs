@@ -103,7 +103,9 @@ pub fn build(request: &Request, place: &Path) -> Result<Bundle, BundlingError> {
     let FileEntry { file, bytes: size, sha256 } = new.file("policy.onnx", &model.encode_to_vec())?;
     let part = PartEntry { name: PartName::Policy, file, bytes: size, sha256, inputs, outputs };
     let policy = PolicyInputs { inputs: adapt::policy_inputs(request, &part), limits: None };
-    let name = request.onnx.file_name().unwrap_or_default().to_string_lossy();
+    // Which files they were, not where they lie on this machine.
+    let name_of = |path: &Path| path.file_name().unwrap_or_default().to_string_lossy().into_owned();
+    let name = name_of(&request.onnx);
     let provenance = Provenance {
         preset: "own".into(),
         data: format!("{name}, sha256 {}", sha256_hex(&bytes)),
@@ -135,7 +137,7 @@ pub fn build(request: &Request, place: &Path) -> Result<Bundle, BundlingError> {
     manifest.initial = new.file("initial.safetensors", &to_bytes(&initial(request, &signature)?)?)?;
     let bundle = new.check(&manifest)?;
     let (golden, words) = match &request.golden {
-        Some(path) => (read(path)?, format!("golden values: {}", path.display())),
+        Some(path) => (read(path)?, format!("golden values: {}", name_of(path))),
         None => golden::record(&bundle, request.golden_ticks)?,
     };
     manifest.provenance.data += &format!("; {words}");
