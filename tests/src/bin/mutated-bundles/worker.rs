@@ -6,10 +6,9 @@ use std::sync::atomic::{AtomicU64, Ordering};
 use std::time::{Duration, Instant};
 
 use anyhow::Context;
-use rcwm_models::IMAGE_BYTES;
 use rcwm_models::bundle::Bundle;
 use rcwm_models::errors::one_line;
-use rcwm_runtime::policy::Sampling;
+use rcwm_runtime::policy::{Inputs, Sampling};
 use rcwm_runtime::{Decision, EngineSettings, Policy};
 use rustix::process::{Resource, Rlimit, setrlimit};
 use rustix::time::{ClockId, clock_gettime};
@@ -100,7 +99,10 @@ fn use_as_the_runtime_does(folder: &Path) -> (&'static str, String) {
     if let Err(error) = rcwm_lab::inspect::inspect(&bundle) {
         return ("inspect", one_line(&error));
     }
-    let mut policy = match Policy::new(&bundle, EngineSettings::tract(), Sampling::Sample { seed: 1 }) {
+    // A policy without a world model has nothing to sample.
+    let samples = bundle.manifest.model.is_some();
+    let sampling = if samples { Sampling::Sample { seed: 1 } } else { Sampling::Mode };
+    let mut policy = match Policy::new(&bundle, EngineSettings::tract(), sampling) {
         Ok(policy) => policy,
         Err(error) => return ("load", one_line(&error)),
     };
@@ -118,14 +120,16 @@ fn use_as_the_runtime_does(folder: &Path) -> (&'static str, String) {
 
 /// Some ticks; whether every action was fit to send.
 fn ticks(policy: &mut Policy) -> Result<bool, rcwm_runtime::PolicyError> {
-    let image: Vec<u8> = (0..IMAGE_BYTES).map(|i| ((i * 7) >> 3) as u8).collect();
+    let image: Vec<u8> = (0..policy.image_bytes()).map(|i| ((i * 7) >> 3) as u8).collect();
+    let state = vec![0.5; policy.manifest().measured_numbers()];
+    let seen = Inputs { image: &image, state: &state };
     let limits = policy.limits();
     let fit = |decision: &Decision| limits.clamp(decision.action) == decision.action;
     let mut executed = None;
     for tick in 0..4 {
         let decision = match (tick, &executed) {
             (2, Some(action)) => policy.imagine(action)?,
-            _ => policy.observe(&image, executed.as_ref())?,
+            _ => policy.observe(seen, executed.as_ref())?,
         };
         if !fit(&decision) {
             return Ok(false);
