@@ -196,7 +196,9 @@ fn a_robot_of_one_s_own_in_python_is_driven_by_a_policy_for_its_interface() {
     command.args(["run", "--instance", "mine", "--bundle"]).arg(&bundle).arg("--json").arg(&json);
     let mut runtime = Running::start(command);
     let mut robot: Command = domain.python(&examples.join("robot.py"));
-    robot.args(["--instance", "mine", "--episodes", "2"]).env("PYTHONPATH", root().join("runtime/python/src"));
+    robot
+        .args(["--instance", "mine", "--episodes", "2"])
+        .env("PYTHONPATH", root().join("runtime/python/src"));
     let told = output(robot);
     assert!(told.status.success(), "{}", String::from_utf8_lossy(&told.stderr));
     let counts: serde_json::Value = serde_json::from_slice(&told.stdout).unwrap();

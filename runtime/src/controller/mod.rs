@@ -118,7 +118,7 @@ impl Controller {
     /// [`ControllerError::Link`], or what is wrong with the fallback.
     pub fn open(policy: Policy, settings: ControllerSettings) -> Result<Self, ControllerError> {
         // What is wrong with the settings is said before anybody is connected to.
-        let filter = safety_filter(&policy, &settings)?;
+        let filter = settings.safety_filter(&policy)?;
         let manifest = policy.manifest().clone();
         let link = ControllerLink::open(settings.link.clone(), move |robot| manifest.mismatches(robot))?;
         Ok(Self::with(Box::new(link), filter, policy, settings))
@@ -133,7 +133,7 @@ impl Controller {
         policy: Policy,
         settings: ControllerSettings,
     ) -> Result<Self, ControllerError> {
-        let filter = safety_filter(&policy, &settings)?;
+        let filter = settings.safety_filter(&policy)?;
         Ok(Self::with(link, filter, policy, settings))
     }
 
@@ -393,28 +393,4 @@ impl Controller {
     pub fn close(&self) -> Result<(), ControllerError> {
         Ok(self.link.say_closed()?)
     }
-}
-
-/// The safety filter of a policy under these settings.
-fn safety_filter(policy: &Policy, settings: &ControllerSettings) -> Result<SafetyFilter, ControllerError> {
-    settings.surprise.check(policy.manifest().kind)?;
-    let limits = policy.limits();
-    let all_are_positions = (0..limits.numbers()).all(|at| limits.is_absolute(at));
-    match settings.fallback {
-        Fallback::Zero if all_are_positions => return Err(ControllerError::ZeroIsAPose),
-        Fallback::Given(action) if action.len() != limits.numbers() => {
-            let (found, expected) = (action.len(), limits.numbers());
-            return Err(ControllerError::FallbackNumbers { found, expected });
-        }
-        Fallback::Given(action) => {
-            // Brought into the limits it would be another pose than the one that was thought safe.
-            let within = |at: &usize| (limits.low[*at]..=limits.high[*at]).contains(&action[*at]);
-            if let Some(at) = (0..action.len()).find(|at| !within(at)) {
-                let (low, high) = (limits.low[at], limits.high[at]);
-                return Err(ControllerError::FallbackLimits { at: at + 1, found: action[at], low, high });
-            }
-        }
-        _ => {}
-    }
-    Ok(SafetyFilter::new(limits, settings.rate_max))
 }

@@ -4,9 +4,9 @@ use std::time::Duration;
 
 use rcwm_models::wire::LinkSettings;
 
-use super::{Fallback, TickLimits};
+use super::{ControllerError, Fallback, SafetyFilter, TickLimits};
 use crate::pacing::PacingSettings;
-use crate::policy::SurpriseLimits;
+use crate::policy::{Policy, SurpriseLimits};
 
 /// How the loop runs.
 #[derive(Debug, Clone)]
@@ -48,5 +48,29 @@ impl ControllerSettings {
             surprise: SurpriseLimits::default(),
             rate_max: None,
         }
+    }
+
+    /// The safety filter of a policy under these settings.
+    pub(super) fn safety_filter(&self, policy: &Policy) -> Result<SafetyFilter, ControllerError> {
+        self.surprise.check(policy.manifest().kind)?;
+        let limits = policy.limits();
+        let all_are_positions = (0..limits.numbers()).all(|at| limits.is_absolute(at));
+        match self.fallback {
+            Fallback::Zero if all_are_positions => return Err(ControllerError::ZeroIsAPose),
+            Fallback::Given(action) if action.len() != limits.numbers() => {
+                let (found, expected) = (action.len(), limits.numbers());
+                return Err(ControllerError::FallbackNumbers { found, expected });
+            }
+            Fallback::Given(action) => {
+                // Brought into the limits it would be another pose than the one that was thought safe.
+                let within = |at: &usize| (limits.low[*at]..=limits.high[*at]).contains(&action[*at]);
+                if let Some(at) = (0..action.len()).find(|at| !within(at)) {
+                    let (low, high) = (limits.low[at], limits.high[at]);
+                    return Err(ControllerError::FallbackLimits { at: at + 1, found: action[at], low, high });
+                }
+            }
+            _ => {}
+        }
+        Ok(SafetyFilter::new(limits, self.rate_max))
     }
 }
