@@ -90,7 +90,8 @@ fn neither_who_asks_nor_the_end_of_the_run_waits_for_a_server_that_does_not_get_
     while !told && start.elapsed() < NEVER {
         let (wait, events) = peer.wait_action(Duration::from_millis(20)).unwrap();
         told = events.closed;
-        assert!(!matches!(wait, Wait::Message(_)), "{wait:?}");
+        // The last one may have been asked for twice, and then is answered twice.
+        assert!(!matches!(&wait, Wait::Message(action) if action.answers != 1), "{wait:?}");
     }
     assert!(told, "the robot was not told");
     let gone = is_gone(server);

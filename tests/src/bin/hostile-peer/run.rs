@@ -68,6 +68,10 @@ pub(crate) fn run(
         // Refused: zeros are a pose.
         setup.fallback = Fallback::Hold;
     }
+    if let Fallback::Given(action) = setup.fallback {
+        // Refused: beyond the bundle's limits.
+        setup.fallback = Fallback::Given(known.limits.clamp(action));
+    }
     let setup = &setup;
     let swaps = steps.iter().any(|(_, step)| matches!(step.deed, Deed::Swap { .. }));
     let swapper = swaps.then(|| swapper(link, setup, &policy)).transpose()?;
