@@ -41,3 +41,13 @@ pub(super) fn reduced(shape: &[usize], axes: &[usize], keep: bool) -> Vec<usize>
         each.filter(|(i, _)| !axes.contains(i)).map(|(_, dim)| *dim).collect()
     }
 }
+
+/// Two factors, and a bias where there is one.
+pub(super) fn with_bias<'a>(
+    inputs: &[&'a Value],
+) -> Result<(&'a Value, &'a Value, Option<&'a Value>), String> {
+    match inputs.len() {
+        2 => floats(inputs).map(|[a, b]| (a, b, None)),
+        _ => floats(inputs).map(|[a, b, bias]| (a, b, Some(bias))),
+    }
+}

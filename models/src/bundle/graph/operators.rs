@@ -1,7 +1,7 @@
 //! Operators that compute: element by element, products, convolutions, reductions.
 
 use super::attributes::Attributes;
-use super::inferred::{Inferred, broadcast, floats, reduced, take};
+use super::inferred::{Inferred, broadcast, floats, reduced, take, with_bias};
 use super::value::Value;
 use super::window::{Window, picture_side};
 use super::{DType, Limits, movement, policies};
@@ -149,16 +149,7 @@ struct Picture<'a> {
 
 /// Kernel and bias are constants.
 fn picture<'a>(inputs: &[&'a Value]) -> Result<Picture<'a>, String> {
-    let (x, kernel, bias) = match inputs.len() {
-        2 => {
-            let [x, kernel] = floats(inputs)?;
-            (x, kernel, None)
-        }
-        _ => {
-            let [x, kernel, bias] = floats(inputs)?;
-            (x, kernel, Some(bias))
-        }
-    };
+    let (x, kernel, bias) = with_bias(inputs)?;
     if !kernel.is_constant || bias.is_some_and(|bias| !bias.is_constant) {
         return Err("kernel and bias must be constants".into());
     }

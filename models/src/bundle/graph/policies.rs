@@ -1,7 +1,7 @@
 //! Operators that policies of other libraries use beside ours: recurrent cells, small networks on vectors and pictures.
 
 use super::attributes::{Attributes, axis_of};
-use super::inferred::{Inferred, broadcast, floats, reduced, take};
+use super::inferred::{Inferred, broadcast, floats, reduced, take, with_bias};
 use super::movement::constant_integers;
 use super::value::Value;
 use super::window::{Window, picture_side, small};
@@ -113,16 +113,7 @@ fn flatten(attributes: &mut Attributes<'_>, inputs: &[&Value]) -> Inferred {
 
 /// `x W + b`, each matrix turned if its flag says so.
 fn gemm(attributes: &mut Attributes<'_>, inputs: &[&Value]) -> Inferred {
-    let (a, b, bias) = match inputs.len() {
-        2 => {
-            let [a, b] = floats(inputs)?;
-            (a, b, None)
-        }
-        _ => {
-            let [a, b, bias] = floats(inputs)?;
-            (a, b, Some(bias))
-        }
-    };
+    let (a, b, bias) = with_bias(inputs)?;
     for name in ["alpha", "beta"] {
         if let Some(number) = attributes.float(name)?.filter(|number| !number.is_finite()) {
             return Err(format!("{name} is {number}"));
