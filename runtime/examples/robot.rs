@@ -9,7 +9,8 @@
 
 mod table;
 
-use std::sync::atomic::AtomicBool;
+use std::sync::Arc;
+use std::sync::atomic::{AtomicBool, Ordering};
 use std::time::Duration;
 
 use clap::Parser;
@@ -57,7 +58,11 @@ fn main() -> anyhow::Result<()> {
     let Arguments { instance, episodes, steps, realtime, timeout_s } = Arguments::parse();
     let link = SimulatorLink::open(LinkSettings::new(&instance), &Format::metaworld())?;
     let settings = ServeSettings { episodes, steps, realtime, timeout: Duration::from_secs_f64(timeout_s) };
-    let served = serve(&mut Table::new(0), link, &settings, &AtomicBool::new(false))?;
+    let stop = Arc::new(AtomicBool::new(false));
+    let asked = Arc::clone(&stop);
+    // After Ctrl-C the controller is told, and the robot rests.
+    ctrlc::set_handler(move || asked.store(true, Ordering::Relaxed))?;
+    let served = serve(&mut Table::new(0), link, &settings, &stop)?;
     println!("{}", serde_json::to_string_pretty(&served)?);
     Ok(())
 }

@@ -68,8 +68,13 @@ impl Guard {
         self.commanded = true;
         self.last = ActionValues::from_fn(action.len(), |at| {
             let (number, last) = (&self.numbers[at], self.last[at]);
-            let wanted = action[at].clamp(number.low, number.high);
-            if last.is_nan() { wanted } else { wanted.clamp(last - number.rate_max, last + number.rate_max) }
+            let near = if last.is_nan() {
+                action[at]
+            } else {
+                action[at].clamp(last - number.rate_max, last + number.rate_max)
+            };
+            // Limits come last: a robot may have been moved beyond them.
+            near.clamp(number.low, number.high)
         });
         Ok(self.last)
     }
@@ -80,7 +85,10 @@ impl Guard {
         let safe = |at: usize, number: &ActionNumber| match number.safe {
             Safe::Number(safe) => safe,
             Safe::Hold if commanded => last[at],
-            Safe::Hold | Safe::HoldMeasured => measured(number, state).unwrap_or(f32::NAN),
+            // What was executed last is the next best.
+            Safe::Hold | Safe::HoldMeasured => {
+                measured(number, state).unwrap_or(if commanded { last[at] } else { f32::NAN })
+            }
         };
         let rest: ActionValues =
             self.numbers.iter().enumerate().map(|(at, number)| safe(at, number)).collect();
@@ -138,6 +146,14 @@ mod tests {
     }
 
     #[test]
+    fn limits_come_last_where_a_robot_stands_beyond_them() {
+        let mut guard = arm();
+        guard.begin(&[0.0, 0.0]);
+        guard.executed(&[0.0, 1.9].into()).unwrap();
+        assert_eq!(guard.accept(&[0.0, 1.6]).unwrap(), [0.0, 1.7]);
+    }
+
+    #[test]
     fn what_is_no_action_of_this_robot_is_not_executed() {
         let mut guard = arm();
         guard.begin(&[0.0, 0.0]);
@@ -154,7 +170,8 @@ mod tests {
         guard.begin(&[0.0, 0.0]);
         guard.accept(&[0.05, 0.05]).unwrap();
         assert_eq!(guard.rest(&[0.03, 0.02]).unwrap(), [0.03, 0.02]);
-        assert!(guard.rest(&[f32::NAN, 0.0]).is_none(), "what is not measured cannot be held");
+        assert_eq!(guard.rest(&[f32::NAN, 0.01]).unwrap(), [0.03, 0.01], "what is not measured now");
+        assert!(arm().rest(&[f32::NAN, 0.0]).is_none(), "what is not known cannot be held");
         let mut hand = Guard::new(&Interface::metaworld());
         hand.begin(&[0.0; 18]);
         hand.accept(&[0.5; 4]).unwrap();

@@ -8,6 +8,7 @@ mod guard;
 #[cfg(test)]
 mod tests;
 
+use std::panic::{AssertUnwindSafe, catch_unwind, resume_unwind};
 use std::sync::atomic::{AtomicBool, Ordering};
 use std::time::{Duration, Instant};
 
@@ -24,7 +25,7 @@ pub type RobotError = Box<dyn std::error::Error + Send + Sync>;
 
 /// A robot, or a simulator of one.
 pub trait Robot {
-    /// Goes to where an episode starts.
+    /// Goes to where an episode starts. What was executed last may still be going on.
     ///
     /// # Errors
     /// The robot's own.
@@ -50,7 +51,7 @@ pub struct ServeSettings {
     pub episodes: u64,
     /// Actions an episode, at most.
     pub steps: u32,
-    /// At the interface's rate; else the robot waits for every answer.
+    /// At the interface's rate; else every observation waits for its answer, which only a simulator can.
     pub realtime: bool,
     /// Longest wait for an answer where one is waited for.
     pub timeout: Duration,
@@ -122,15 +123,17 @@ pub fn serve(
         work_ns: 0,
         runs: false,
     };
-    let result = (0..settings.episodes).try_for_each(|episode| loop_.episode(episode));
+    // A panic of the robot's program is caught until both are told, and then goes on.
+    let served_all = || (0..settings.episodes).try_for_each(|episode| loop_.episode(episode));
+    let result = catch_unwind(AssertUnwindSafe(served_all));
     // The controller first, then the robot: neither is left with the last command.
     let Loop { robot, mut guard, observation, link, served, runs, .. } = loop_;
     let closed = link.close();
-    if runs && let Some(rest) = guard.rest(observation.view().state()) {
-        let episode = served.episodes;
-        robot.execute(&rest).map_err(|source| ServeError::Robot { episode, source })?;
-    }
-    result?;
+    let rest = if runs { guard.rest(observation.view().state()) } else { None };
+    let rested = rest.map_or(Ok(()), |rest| robot.execute(&rest).map(drop));
+    // What ended the loop comes first.
+    result.unwrap_or_else(|panic| resume_unwind(panic))?;
+    rested.map_err(|source| ServeError::Robot { episode: served.episodes, source })?;
     closed?;
     Ok(served)
 }

@@ -11,6 +11,7 @@ struct Joints {
     heavy: bool,
     executed: Vec<ActionValues>,
     fails_at: Option<usize>,
+    panics_at: Option<usize>,
     measures: Option<f32>,
 }
 
@@ -34,6 +35,7 @@ impl Robot for Joints {
         if self.fails_at == Some(self.executed.len()) {
             return Err("the brakes are on".into());
         }
+        assert_ne!(self.panics_at, Some(self.executed.len()), "a fault of the robot's program");
         let share = if self.heavy { 0.5 } else { 1.0 };
         let moved: ActionValues =
             self.at.iter().zip(action.iter()).map(|(at, to)| at + share * (to - at)).collect();
@@ -126,6 +128,21 @@ fn a_robot_that_fails_is_told_to_rest_and_its_words_are_kept() {
     let failed = with_controller(&mut robot, "fails", LOCKSTEP, |_, _| Some(vec![0.5, -0.5]));
     let said = failed.unwrap_err().to_string();
     assert!(said.contains("episode 0") && said.contains("the brakes are on"), "{said}");
+    assert_eq!(robot.executed.len(), 3, "and then the safe action");
+}
+
+#[test]
+fn a_robot_whose_program_panics_rests_before_that_goes_on() {
+    let mut robot = Joints { panics_at: Some(2), ..Joints::default() };
+    let (settings, _domain) = domain("panics");
+    let link = SimulatorLink::open(settings.clone(), &arm()).unwrap();
+    std::thread::scope(|scope| {
+        let controller = scope.spawn(|| answer_all(settings, |_, _| Some(vec![0.5, -0.5])));
+        let served =
+            catch_unwind(AssertUnwindSafe(|| serve(&mut robot, link, &LOCKSTEP, &AtomicBool::new(false))));
+        assert!(served.is_err());
+        controller.join().unwrap();
+    });
     assert_eq!(robot.executed.len(), 3, "and then the safe action");
 }
 
