@@ -1,11 +1,11 @@
-//! Deploys an exported RCWM bundle as a controller.
+//! Deploys a bundle (RCWM, DreamerV3 or any ONNX policy) as a controller.
 //!
 //! | module | holds |
 //! | --- | --- |
 //! | [`engine`] | what runs an ONNX part: tract, or ONNX Runtime (feature `ort`) |
 //! | [`mod@compile`] | the exported parts as one graph, its hot nodes fused, cut where the image comes in |
 //! | [`operators`] | our operators in tract, which the fused nodes become |
-//! | [`policy`] | one tick: image and executed action in, action distribution out; carries z and h of both branches |
+//! | [`policy`] | one tick: observation and executed action in, action out; carries z and h of every branch, or what the graph carries |
 //! | [`controller`] | the loop over shared memory: state machine, fallback, action limits, counters |
 //! | [`pacing`] | when the next observation is due, how to wait for it, when it counts as late |
 //! | [`realtime`] | what Linux grants a thread that must be on time |
@@ -32,7 +32,7 @@
 //! # Ok::<(), rcwm_runtime::PolicyError>(())
 //! ```
 //!
-//! In a program of its own that has a rate to keep: [`realtime::keep_memory`] first thing in `main`, [`Policy::prepare`] shortly before an image comes.
+//! In a program of its own that has a rate to keep: [`realtime::keep_memory`] first thing in `main`, [`Policy::warm_caches`] shortly before an image comes.
 //!
 //! This crate never links candle or Python.
 

@@ -73,8 +73,6 @@ fn the_compiled_tick_gives_what_the_exported_parts_give_and_two_threads_the_same
         assert_eq!((again.surprise, again.recomputed), (found.surprise, true));
         one.set_state(exported.state()).unwrap();
         two.set_state(exported.state()).unwrap();
-        let state = exported.state().clone();
-        exported.set_state(&state).unwrap();
     }
 }
 

@@ -63,7 +63,7 @@ pub enum BundleError {
     #[error("bundle: {part}: {source}")]
     Onnx { part: PartName, source: OnnxError },
     /// A part's graph does something that it must not.
-    #[error("bundle: {part}: {source}; export it again with the matching trainer")]
+    #[error("bundle: {part}: {source}; export it again: docs/own-policy.md lists the operators")]
     Graph {
         part: PartName,
         /// What it does.

@@ -31,7 +31,7 @@ pub enum WriteError {
     #[error("the manifest: {0}")]
     Manifest(#[from] toml::ser::Error),
     /// The finished bundle does not open.
-    #[error("the finished bundle was refused: {0}")]
+    #[error("the bundle would be refused: {0}")]
     Refused(#[from] BundleError),
 }
 

@@ -1,4 +1,4 @@
-//! What is looked at on a desk of what runs on a robot.
+//! What is looked at off the robot of what runs on a robot.
 //!
 //! | module | holds |
 //! | --- | --- |

@@ -54,7 +54,7 @@ impl From<&anyhow::Error> for Exit {
     }
 }
 
-/// Deploys an exported RCWM bundle as a controller.
+/// Deploys a bundle (RCWM, DreamerV3 or any ONNX policy) as a controller.
 #[derive(Debug, Parser)]
 #[command(name = "rcwm-runtime", version, about, after_help = EXAMPLES)]
 struct Arguments {

@@ -13,7 +13,7 @@ use crate::realtime::{self, Granted, Request};
 #[derive(Debug, Args)]
 #[command(next_help_heading = "When things go wrong")]
 pub(super) struct SafetyArguments {
-    /// What is sent when the policy has nothing fit to send: what the robot's interface says of each number, hold (the action
+    /// What is sent when the policy has nothing valid to send: what the robot's interface says of each number, hold (the action
     /// executed last), zero (no motion, where actions are displacements or velocities; refused where they are positions), or the
     /// numbers of an action in the interface's units
     #[arg(

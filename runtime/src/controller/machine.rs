@@ -19,7 +19,7 @@ pub enum State {
         /// Imagined ticks in a row.
         ticks: u32,
     },
-    /// The policy has nothing fit to send: the fallback is sent.
+    /// The policy has nothing valid to send: the fallback is sent.
     Fallback {
         /// Fallback ticks in a row.
         ticks: u32,
@@ -33,7 +33,7 @@ pub enum State {
     },
 }
 
-/// Why the policy has nothing fit to send.
+/// Why the policy has nothing valid to send.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Hash, Serialize)]
 #[serde(rename_all = "snake_case")]
 pub enum Cause {
@@ -72,7 +72,7 @@ impl std::fmt::Display for Cause {
 pub enum Event {
     /// A new observation came and the policy decided on it, within all limits.
     Decided,
-    /// A new observation came, or one was to be imagined, and there is nothing fit to send.
+    /// A new observation came, or one was to be imagined, and there is nothing valid to send.
     Invalid(Cause),
     /// An observation is overdue (real time only).
     Overdue,

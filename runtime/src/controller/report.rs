@@ -64,7 +64,7 @@ pub struct Counters {
     pub swaps: u64,
     /// Observations that were scheduled or published later than they were received: the peer's clock is ahead.
     pub clock_ahead: u64,
-    /// Answers that were not sent because there was nothing fit to send, nor anything known that could be held.
+    /// Answers that were not sent because there was nothing valid to send, nor anything known that could be held.
     pub withheld_answers: u64,
 }
 
@@ -269,7 +269,7 @@ impl RunReport {
         }
         if c.withheld_answers > 0 {
             text += &format!(
-                "withheld   {} answers: nothing fit to send, and no position known that could be held\n",
+                "withheld   {} answers: nothing valid to send, and no position known that could be held\n",
                 c.withheld_answers
             );
         }

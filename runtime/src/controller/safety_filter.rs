@@ -8,7 +8,7 @@ use serde::{Deserialize, Serialize};
 
 use crate::policy::ActionLimits;
 
-/// What is sent when the policy has nothing fit to send.
+/// What is sent when the policy has nothing valid to send.
 #[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
 #[serde(rename_all = "lowercase")]
 #[expect(clippy::large_enum_variant, reason = "copied by a loop that must not allocate")]

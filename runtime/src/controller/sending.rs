@@ -62,7 +62,7 @@ impl Controller {
         Ok(unsent(sequence, source, action))
     }
 
-    /// The only way onto the wire. Where there is nothing fit to send nor to hold, the robot goes on with what it knows itself.
+    /// The only way onto the wire. Where there is nothing valid to send nor to hold, the robot goes on with what it knows itself.
     pub(super) fn send(
         &mut self,
         sequence: u64,

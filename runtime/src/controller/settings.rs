@@ -24,7 +24,7 @@ pub struct ControllerSettings {
     pub pacing: PacingSettings,
     /// How long the policy is done without.
     pub ticks: TickLimits,
-    /// What is sent when the policy has nothing fit to send.
+    /// What is sent when the policy has nothing valid to send.
     pub fallback: Fallback,
     /// How much surprise is borne.
     pub surprise: SurpriseLimits,

@@ -24,9 +24,9 @@ pub struct Header {
     pub engine: EngineSettings,
     /// How latents and actions were chosen, and the seed.
     pub sampling: Sampling,
-    /// What was sent where the policy had nothing fit to send.
+    /// What was sent where the policy had nothing valid to send.
     pub fallback: Fallback,
-    /// Largest change of an action's component from one action to the next.
+    /// Largest change of each number from one action to the next, as a share of half of its range.
     pub rate_max: Option<f32>,
     /// Names of the stages of a tick whose times each record holds, in order.
     pub stages: Vec<String>,

@@ -31,7 +31,7 @@ pub struct LogSettings {
     pub engine: EngineSettings,
     /// How latents and actions are chosen.
     pub sampling: Sampling,
-    /// What is sent where the policy has nothing fit to send.
+    /// What is sent where the policy has nothing valid to send.
     pub fallback: Fallback,
     /// Largest change of an action's component from one action to the next.
     pub rate_max: Option<f32>,

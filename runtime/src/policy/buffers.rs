@@ -31,7 +31,7 @@ pub struct BranchBuffers {
 /// Everything between the parts of a tick.
 #[derive(Debug, Clone, Default)]
 pub struct Buffers {
-    /// Features of the shared encoder, `[2c, S/4, S/4]`; only where the parts run as exported.
+    /// What the encoder gives: `[2c, S/4, S/4]` of kind `rcwm`, `[8c, 4, 4]` of `dreamer`; only where the parts run as exported.
     pub features: Vec<f32>,
     /// In the order of [`BundleKind::branches`]; of a policy without a world model one, whose `h_next` is all that is carried on.
     pub branches: Vec<BranchBuffers>,

@@ -1,8 +1,8 @@
-//! One tick of the policy: image and executed action in, action distribution out.
+//! One tick of the policy: observation and executed action in, action out.
 //!
-//! `sequential` runs the exported parts as they are, `compiled` their segments, which work ahead of the image.
-//!
-//! With `z` and `h` carried from the last tick (z the posterior, eq. 6):
+//! `sequential` runs the exported parts as they are, `compiled` their segments, which work ahead of the image, `recurrent` a policy in one
+//! graph. Kind `dreamer` has `dynamics` in place of robot, interaction and environment. Of kind `rcwm`, with `z` and `h` carried from the
+//! last tick (z the posterior, eq. 6):
 //!
 //! ```text
 //! features        = encoder(image)
@@ -166,9 +166,9 @@ impl Policy {
 
     /// Decides on one observation and carries the state on.
     ///
-    /// `inputs` are an image of the size of the encoder's input, and the measured state where the bundle reads one; `executed_action`, in the interface's units, is what was really
-    /// executed to get here, and none at the first
-    /// observation of an episode, which starts from the learned initial state.
+    /// `inputs` are the cameras' pictures, and the measured state where the bundle reads one; `executed_action`, in the interface's
+    /// units, is what was really executed to get here, and none at the first observation of an episode, which starts from the
+    /// bundle's initial state.
     ///
     /// # Errors
     /// [`PolicyError::Observation`], [`PolicyError::Engine`] or [`PolicyError::NotFinite`]; the carried state is then that of

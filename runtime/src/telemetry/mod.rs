@@ -32,7 +32,7 @@ pub enum Stage {
     PublishLag,
     /// Observation published -> received.
     Receive,
-    /// Shared encoder.
+    /// Encoder; of `rcwm` what both branches share.
     Encoder,
     /// Robot branch.
     Robot,
@@ -247,6 +247,11 @@ mod tests {
         let latency = telemetry.latency(Stage::Receive);
         assert_eq!(latency.count, 2);
         assert!(latency.max_us >= 59e6, "{latency:?}");
+    }
+
+    #[test]
+    fn the_stages_of_the_policy_are_named_as_its_parts() {
+        assert_eq!(Stage::POLICY.map(Stage::as_str), STAGES.map(rcwm_models::bundle::PartName::as_str));
     }
 
     #[test]

@@ -127,7 +127,7 @@ impl<'a> Checker<'a> {
         tick: usize,
     ) -> Result<Input<'b>, VerifyError> {
         let (golden, branches) = (self.golden, self.bundle.manifest.kind.branches());
-        let own = || branches.iter().position(|branch| *branch == part).unwrap_or(0);
+        let own = || branches.iter().position(|branch| *branch == part).expect("z and h enter branches only");
         Ok(match (part, name) {
             (_, "image") => Input::U8(golden.image(tick)?),
             (_, "features") => Input::F32(self.encoder.as_ref().map_or(&[], |encoder| &encoder.features)),
@@ -142,7 +142,8 @@ impl<'a> Checker<'a> {
             (PartName::Interaction, "environment_z") => Input::I64(&states.before.branches[1].z),
             (_, of_branch) => {
                 let is_of = |branch: &PartName| of_branch.starts_with(branch.as_str());
-                let branch = &states.after.branches[branches.iter().position(is_of).unwrap_or(0)];
+                let branch = &states.after.branches
+                    [branches.iter().position(is_of).expect("the signature names branches of the kind")];
                 if of_branch.ends_with("_z") { Input::I64(&branch.z) } else { Input::F32(&branch.h) }
             }
         })

@@ -5,7 +5,7 @@ use rcwm_models::interface::NotFinite;
 use rcwm_models::wire::{ObservationFlags, ObservationSample};
 
 use super::policy::PolicyInput;
-use crate::simulators::{Client, ClientError, Launch, SimulatorProcess, unfit_to_act};
+use crate::simulators::{Client, ClientError, Launch, SimulatorProcess, mismatches_to_act};
 
 /// Why acting in simulators failed.
 #[derive(Debug, thiserror::Error)]
@@ -98,10 +98,10 @@ impl Fleet {
         // All load at the same time.
         let processes = launches.iter().map(SimulatorProcess::start).collect::<Result<Vec<_>, _>>()?;
         for process in processes {
-            clients.push(Client::of(process, unfit_to_act)?);
+            clients.push(Client::of(process, mismatches_to_act)?);
         }
         for instance in join {
-            clients.push(Client::join(instance, unfit_to_act)?);
+            clients.push(Client::join(instance, mismatches_to_act)?);
         }
         if clients.is_empty() {
             return Err(FleetError::Nobody);

@@ -13,8 +13,8 @@ use crate::simulators::Launch;
 /// What a report of [`closed_loop_in_trainer`] gives as its engine.
 pub const TRAINER_ENGINE: &str = "trainer";
 
-/// Runs a policy in simulators and counts its successes, deciding in this process (`--engine trainer`), such as the vanilla
-/// baseline, and while a policy learns. The agent's parameters must be frozen. Layouts, episodes and what counts as success are those of [`super::closed_loop`].
+/// Runs a policy in simulators and counts its successes, deciding in this process: `--engine trainer`, and while a policy learns.
+/// The agent's parameters must be frozen. Layouts, episodes and what counts as success are those of [`super::closed_loop`].
 ///
 /// # Errors
 /// See [`ClosedLoopError`]; every process has ended then.

@@ -32,11 +32,11 @@ pub struct Client {
 }
 
 /// Everything in which a robot is not what is needed.
-pub type Unfit = fn(&Interface) -> Vec<Mismatch>;
+pub type Mismatches = fn(&Interface) -> Vec<Mismatch>;
 
 /// In what a robot is not one that the trainer can record: commands of which zeros are no motion, and that may change at once. Whatever
 /// else it offers is recorded.
-pub fn unfit_to_record(robot: &Interface) -> Vec<Mismatch> {
+pub fn mismatches_to_record(robot: &Interface) -> Vec<Mismatch> {
     let mut found = Vec::new();
     for action in &robot.action {
         let place = format!("action {}", action.name);
@@ -52,8 +52,8 @@ pub fn unfit_to_record(robot: &Interface) -> Vec<Mismatch> {
 }
 
 /// In what a robot is not one that the trainer can act on: it looks at the first camera, of its own size.
-pub fn unfit_to_act(robot: &Interface) -> Vec<Mismatch> {
-    let mut found = unfit_to_record(robot);
+pub fn mismatches_to_act(robot: &Interface) -> Vec<Mismatch> {
+    let mut found = mismatches_to_record(robot);
     let picture = [IMAGE_SIDE, IMAGE_SIDE, 3];
     match robot.camera.first() {
         None => found.push(Mismatch::new("camera", "there is none, and the trainer acts by what it sees")),
@@ -71,14 +71,14 @@ pub fn unfit_to_act(robot: &Interface) -> Vec<Mismatch> {
 
 impl Client {
     /// Connects to the simulator that was started.
-    pub fn of(process: SimulatorProcess, unfit: Unfit) -> Result<Self, ClientError> {
-        let link = ControllerLink::open(LinkSettings::new(process.instance()), unfit)?;
+    pub fn of(process: SimulatorProcess, mismatches: Mismatches) -> Result<Self, ClientError> {
+        let link = ControllerLink::open(LinkSettings::new(process.instance()), mismatches)?;
         Ok(Self { link, process: Some(process), answer: None })
     }
 
     /// Connects to a simulator that runs, or will.
-    pub fn join(instance: &str, unfit: Unfit) -> Result<Self, ClientError> {
-        let link = ControllerLink::open(LinkSettings::new(instance), unfit)?;
+    pub fn join(instance: &str, mismatches: Mismatches) -> Result<Self, ClientError> {
+        let link = ControllerLink::open(LinkSettings::new(instance), mismatches)?;
         Ok(Self { link, process: None, answer: None })
     }
 

@@ -14,7 +14,7 @@ use rcwm_models::wire::{ActionValues, Format};
 use serde::Serialize;
 
 use super::recorder::{Recorded, Recorder};
-use super::{Client, CollectError, Job, LEARNING, Launch, Plan, SimulatorProcess, unfit_to_record};
+use super::{Client, CollectError, Job, LEARNING, Launch, Plan, SimulatorProcess, mismatches_to_record};
 
 /// A simulator whose trainer is gone ends by itself after so long.
 const SILENCE_MAX: Duration = Duration::from_secs(60);
@@ -196,7 +196,7 @@ fn run_job(
         program: None,
         silence_max: SILENCE_MAX,
     })?;
-    let mut recorder = Recorder::new(Client::of(process, unfit_to_record)?);
+    let mut recorder = Recorder::new(Client::of(process, mismatches_to_record)?);
     // The simulator decides by itself: an answer is a receipt.
     while let Some(recorded) = recorder.episode(stop, Format::rest, || progress(Progress::Step))? {
         keep(job, &recorded)?;
@@ -217,7 +217,7 @@ pub fn record(
     progress: &(dyn Fn(Progress) + Sync),
 ) -> Result<Sums, CollectError> {
     let mut random = ChaCha8Rng::seed_from_u64(seed);
-    let mut recorder = Recorder::new(Client::join(instance, unfit_to_record)?);
+    let mut recorder = Recorder::new(Client::join(instance, mismatches_to_record)?);
     let mut sums = Sums::new();
     for _ in 0..episodes {
         let decide = |format: &Format| {

@@ -17,7 +17,7 @@ mod plan;
 mod process;
 mod recorder;
 
-pub use client::{Client, ClientError, unfit_to_act, unfit_to_record};
+pub use client::{Client, ClientError, mismatches_to_act, mismatches_to_record};
 pub use collect::{CollectSettings, Collected, Progress, Sums, collect, collect_disturbed, record};
 pub use collect_error::CollectError;
 pub use plan::{Amounts, Job, Plan, Script};

@@ -24,6 +24,16 @@ impl<'a> Attributes<'a> {
         Ok(Self(all))
     }
 
+    /// Numbers that may be there, and are then finite.
+    pub(super) fn finite(&mut self, names: &[&str]) -> Result<(), String> {
+        for name in names {
+            if let Some(number) = self.float(name)?.filter(|number| !number.is_finite()) {
+                return Err(format!("{name} is {number}"));
+            }
+        }
+        Ok(())
+    }
+
     fn take(&mut self, name: &str, kind: i32) -> Result<Option<&'a Attribute>, String> {
         let Some(index) = self.0.iter().position(|attribute| attribute.name == name) else { return Ok(None) };
         let attribute = self.0.swap_remove(index);

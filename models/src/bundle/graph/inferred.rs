@@ -1,6 +1,7 @@
 //! What an operator makes of its inputs, for all of them.
 
 use super::DType;
+use super::attributes::axis_of;
 use super::value::Value;
 
 /// What a rule gives: the outputs, or what does not fit.
@@ -50,4 +51,17 @@ pub(super) fn with_bias<'a>(
         2 => floats(inputs).map(|[a, b]| (a, b, None)),
         _ => floats(inputs).map(|[a, b, bias]| (a, b, Some(bias))),
     }
+}
+
+/// Axes that are there, none twice.
+pub(super) fn distinct(axes: &[i64], rank: usize) -> Result<Vec<usize>, String> {
+    let mut seen = Vec::new();
+    for axis in axes {
+        let axis = axis_of(*axis, rank)?;
+        if seen.contains(&axis) {
+            return Err(format!("axes {axes:?} name one twice"));
+        }
+        seen.push(axis);
+    }
+    Ok(seen)
 }

@@ -37,7 +37,7 @@ impl Limits {
 pub enum GraphError {
     /// Written for other operators.
     #[error(
-        "operator sets {found:?}, expected the standard one, version {} or {}; export with opset 17",
+        "operator sets {found:?}, expected the standard one, version {} to {}; export with opset 17",
         OPSETS.start(),
         OPSETS.end()
     )]

@@ -1,7 +1,7 @@
 //! Operators that compute: element by element, products, convolutions, reductions.
 
 use super::attributes::Attributes;
-use super::inferred::{Inferred, broadcast, floats, reduced, take, with_bias};
+use super::inferred::{Inferred, broadcast, distinct, floats, reduced, take, with_bias};
 use super::value::Value;
 use super::window::{Window, picture_side};
 use super::{DType, Limits, movement, policies};
@@ -24,7 +24,7 @@ pub(super) fn infer(
         "LayerNormalization" => layer_norm(attributes, inputs),
         "MatMul" => mat_mul(inputs),
         "ReduceSum" => reduce_sum(attributes, inputs),
-        "Softmax" => softmax(attributes, inputs),
+        "LogSoftmax" | "Softmax" => softmax(attributes, inputs),
         "Concat" => movement::concat(attributes, inputs),
         "Gather" => movement::gather(attributes, inputs),
         "Reshape" => movement::reshape(inputs),
@@ -120,16 +120,8 @@ fn reduce_sum(attributes: &mut Attributes<'_>, inputs: &[&Value]) -> Inferred {
         return Err(format!("the input is {}, expected floats", x.text()));
     }
     let keep = attributes.flag("keepdims", true)?;
-    let axes = movement::constant_integers(axes, "axes")?;
-    let mut seen = Vec::new();
-    for axis in axes {
-        let axis = super::attributes::axis_of(*axis, x.rank())?;
-        if seen.contains(&axis) {
-            return Err(format!("axes {axes:?} name one twice"));
-        }
-        seen.push(axis);
-    }
-    Ok(vec![Value::new(DType::F32, reduced(&x.shape, &seen, keep))])
+    let axes = distinct(movement::constant_integers(axes, "axes")?, x.rank())?;
+    Ok(vec![Value::new(DType::F32, reduced(&x.shape, &axes, keep))])
 }
 
 fn softmax(attributes: &mut Attributes<'_>, inputs: &[&Value]) -> Inferred {

@@ -1,7 +1,7 @@
 //! Operators that policies of other libraries use beside ours: recurrent cells, small networks on vectors and pictures.
 
 use super::attributes::{Attributes, axis_of};
-use super::inferred::{Inferred, broadcast, floats, reduced, take, with_bias};
+use super::inferred::{Inferred, broadcast, distinct, floats, reduced, take, with_bias};
 use super::movement::constant_integers;
 use super::value::Value;
 use super::window::{Window, picture_side, small};
@@ -32,10 +32,6 @@ pub(super) fn infer(
         "GlobalAveragePool" => global_pool(inputs),
         "Identity" => take::<1>(inputs).map(|[x]| vec![x.reshaped(x.shape.clone())]),
         "LSTM" => cell(attributes, inputs, outputs, 4),
-        "LogSoftmax" => floats::<1>(inputs).and_then(|[x]| {
-            attributes.axis(-1, x.rank())?;
-            Ok(vec![Value::new(DType::F32, x.shape.clone())])
-        }),
         "AveragePool" | "MaxPool" => pool(attributes, inputs, operator == "AveragePool"),
         "Pow" => floats::<2>(inputs)
             .and_then(|[a, b]| Ok(vec![Value::new(DType::F32, broadcast(&a.shape, &b.shape)?)])),
@@ -50,11 +46,7 @@ pub(super) fn infer(
 /// Activations that have numbers of their own.
 fn with_numbers(attributes: &mut Attributes<'_>, inputs: &[&Value]) -> Inferred {
     let [x] = floats(inputs)?;
-    for name in ["alpha", "beta", "gamma"] {
-        if let Some(number) = attributes.float(name)?.filter(|number| !number.is_finite()) {
-            return Err(format!("{name} is {number}"));
-        }
-    }
+    attributes.finite(&["alpha", "beta", "gamma"])?;
     Ok(vec![Value::new(DType::F32, x.shape.clone())])
 }
 
@@ -114,11 +106,7 @@ fn flatten(attributes: &mut Attributes<'_>, inputs: &[&Value]) -> Inferred {
 /// `x W + b`, each matrix turned if its flag says so.
 fn gemm(attributes: &mut Attributes<'_>, inputs: &[&Value]) -> Inferred {
     let (a, b, bias) = with_bias(inputs)?;
-    for name in ["alpha", "beta"] {
-        if let Some(number) = attributes.float(name)?.filter(|number| !number.is_finite()) {
-            return Err(format!("{name} is {number}"));
-        }
-    }
+    attributes.finite(&["alpha", "beta"])?;
     let matrix = |value: &Value, turned: bool| match value.shape[..] {
         [rows, columns] => Ok(if turned { [columns, rows] } else { [rows, columns] }),
         _ => Err(format!("{} is no matrix", value.text())),
@@ -174,19 +162,6 @@ fn reduce_mean(attributes: &mut Attributes<'_>, inputs: &[&Value]) -> Inferred {
     let [x] = floats(&[x])?;
     let keep = attributes.flag("keepdims", true)?;
     Ok(vec![Value::new(DType::F32, reduced(&x.shape, &distinct(axes, x.rank())?, keep))])
-}
-
-/// Axes that are there, none twice.
-fn distinct(axes: &[i64], rank: usize) -> Result<Vec<usize>, String> {
-    let mut seen = Vec::new();
-    for axis in axes {
-        let axis = axis_of(*axis, rank)?;
-        if seen.contains(&axis) {
-            return Err(format!("axes {axes:?} name one twice"));
-        }
-        seen.push(axis);
-    }
-    Ok(seen)
 }
 
 fn squeeze(inputs: &[&Value]) -> Inferred {

@@ -50,6 +50,9 @@ pub enum BundlingError {
     /// Initial states or golden values are unusable.
     #[error("{path}: {source}")]
     Tensors { path: PathBuf, source: TensorsError },
+    /// Something that no input takes.
+    #[error("{path}: tensor {name:?} is not carried by the policy, which carries: {carried}; leave it out")]
+    NotCarried { path: PathBuf, name: String, carried: String },
     /// The policy does not run on what it would be given.
     #[error(transparent)]
     Policy(#[from] PolicyError),
@@ -144,7 +147,14 @@ pub fn build(request: &Request, place: &Path) -> Result<Bundle, BundlingError> {
     manifest.golden = new.file("golden.safetensors", &to_bytes(&golden)?)?;
     let bundle = new.check(&manifest)?;
     let deployed = EngineSettings::single_threaded(EngineKind::Tract);
-    let report = verify(&bundle, deployed, TOLERANCE, &mut || {})?;
+    let report =
+        verify(&bundle, deployed, TOLERANCE, &mut || {}).map_err(|error| match (error, &request.golden) {
+            // The file that was given, not its copy.
+            (VerifyError::Golden { source, .. }, Some(path)) => {
+                BundlingError::Tensors { path: path.clone(), source }
+            }
+            (error, _) => error.into(),
+        })?;
     if let Some(first) = report.failures.into_iter().next() {
         return Err(BundlingError::Missed(first));
     }
@@ -154,7 +164,13 @@ pub fn build(request: &Request, place: &Path) -> Result<Bundle, BundlingError> {
 /// What every episode starts from: as asked, or zeros.
 fn initial(request: &Request, signature: &PolicySignature) -> Result<Tensors, BundlingError> {
     if let Some(path) = &request.initial {
-        return read(path);
+        let tensors = read(path)?;
+        let names: Vec<&str> = signature.carried.iter().map(|spec| spec.name.as_str()).collect();
+        if let Some(name) = tensors.0.keys().find(|name| !names.contains(&name.as_str())) {
+            let (name, carried) = (name.clone(), names.join(", "));
+            return Err(BundlingError::NotCarried { path: path.clone(), name, carried });
+        }
+        return Ok(tensors);
     }
     let zeros = |spec: &TensorSpec| (spec.name.clone(), Values::F32(ArrayD::zeros(IxDyn(&spec.shape))));
     Ok(Tensors(signature.carried.iter().map(zeros).collect()))

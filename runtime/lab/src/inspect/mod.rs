@@ -4,7 +4,7 @@ mod cost;
 
 pub use cost::{Cost, CostError};
 
-use rcwm_models::bundle::{Bundle, Manifest, PartName, TensorSpec};
+use rcwm_models::bundle::{Bundle, Manifest, PartName, Provenance, TensorSpec};
 use serde::Serialize;
 
 /// Why a bundle could not be inspected.
@@ -91,20 +91,17 @@ impl BundleInfo {
                 )
             },
         );
+        // A policy of another library says nothing of how it was trained.
+        let trained = self.manifest.model.as_ref().map_or_else(String::new, |_| {
+            let Provenance { updates, seeds, source_revision, .. } = provenance;
+            format!("; {updates} updates, seeds {seeds:?}, source {source_revision}")
+        });
         format!(
             "task       {task}, robot {} at {} Hz, actions {:?} to {:?}\n\
              model      {kind}, {model}\n\
-             origin     {}; {} updates, seeds {:?}, source {}\n\
+             origin     {}{trained}\n\
              golden     {} ticks\n",
-            interface.name,
-            interface.rate_hz,
-            limits.low,
-            limits.high,
-            provenance.data,
-            provenance.updates,
-            provenance.seeds,
-            provenance.source_revision,
-            self.golden_ticks
+            interface.name, interface.rate_hz, limits.low, limits.high, provenance.data, self.golden_ticks
         )
     }
 
