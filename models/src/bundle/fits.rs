@@ -51,10 +51,19 @@ impl Manifest {
                 || self.interface.state_range(name).is_some()
         };
         match self.policy.inputs.iter().find(|name| !is_known(name)) {
+            None => {}
+            Some(name) => {
+                return Err(BundleError::Invalid(format!(
+                    "policy.inputs: {name:?} is no camera or state of the interface"
+                )));
+            }
+        }
+        let inputs = &self.policy.inputs;
+        match inputs.iter().enumerate().find(|(at, name)| inputs[..*at].contains(name)) {
             None => Ok(()),
-            Some(name) => Err(BundleError::Invalid(format!(
-                "policy.inputs: {name:?} is no camera or state of the interface"
-            ))),
+            Some((_, name)) => {
+                Err(BundleError::Invalid(format!("policy.inputs: {name:?} is there twice, expected once")))
+            }
         }
     }
 

@@ -1,5 +1,8 @@
 //! The state that every episode starts from.
 
+use std::cell::RefCell;
+use std::collections::BTreeSet;
+
 use super::error::BundleError;
 use super::kind::PartName;
 use super::manifest::Manifest;
@@ -23,12 +26,36 @@ pub struct InitialBranch {
     pub h: Vec<f32>,
 }
 
+/// What every episode starts from; the tensors hold that and nothing else.
 pub(super) fn read_initial(manifest: &Manifest, tensors: &Tensors) -> Result<InitialState, BundleError> {
+    let taken = RefCell::new(BTreeSet::new());
+    let initial = read_taken(manifest, tensors, &taken)?;
+    let taken = taken.into_inner();
+    match tensors.0.keys().find(|name| !taken.contains(*name)) {
+        None => Ok(initial),
+        Some(name) => {
+            let expected = match taken.is_empty() {
+                true => "nothing: no state is carried".to_owned(),
+                false => format!("only {}", taken.into_iter().collect::<Vec<_>>().join(", ")),
+            };
+            let source = TensorsError::Unexpected { name: name.clone(), found: "there".into(), expected };
+            Err(BundleError::Tensors { file: manifest.initial.file.clone(), source })
+        }
+    }
+}
+
+fn read_taken(
+    manifest: &Manifest,
+    tensors: &Tensors,
+    taken: &RefCell<BTreeSet<String>>,
+) -> Result<InitialState, BundleError> {
     let wrong = |source| BundleError::Tensors { file: manifest.initial.file.clone(), source };
     let h = |name: &str, shape: &[usize]| -> Result<Vec<f32>, BundleError> {
+        taken.borrow_mut().insert(name.to_owned());
         let array = tensors.f32(name).map_err(wrong)?;
-        if array.shape() != shape || array.iter().any(|x| !x.is_finite()) {
-            let found = format!("{:?}", array.shape());
+        let invalid = array.iter().find(|x| !x.is_finite()).map(|x| format!("a tensor that holds {x}"));
+        if array.shape() != shape || invalid.is_some() {
+            let found = invalid.unwrap_or_else(|| format!("{:?}", array.shape()));
             let expected = format!("finite, {shape:?}");
             return Err(wrong(TensorsError::Unexpected { name: name.to_owned(), found, expected }));
         }
@@ -44,10 +71,13 @@ pub(super) fn read_initial(manifest: &Manifest, tensors: &Tensors) -> Result<Ini
         return Ok(InitialState { branches: vec![all] });
     };
     let z = |name: &str| -> Result<Vec<i64>, BundleError> {
+        taken.borrow_mut().insert(name.to_owned());
         let array = tensors.i64(name).map_err(wrong)?;
         let classes = 0..model.classes as i64;
-        if array.shape() != [1, model.categoricals] || array.iter().any(|class| !classes.contains(class)) {
-            let found = format!("{:?}", array.shape());
+        let invalid = array.iter().find(|class| !classes.contains(class));
+        let invalid = invalid.map(|class| format!("a tensor that holds class {class}"));
+        if array.shape() != [1, model.categoricals] || invalid.is_some() {
+            let found = invalid.unwrap_or_else(|| format!("{:?}", array.shape()));
             let expected = format!("[1, {}] of classes 0 to {}", model.categoricals, model.classes - 1);
             return Err(wrong(TensorsError::Unexpected { name: name.to_owned(), found, expected }));
         }

@@ -11,6 +11,7 @@ use rcwm_lab::log::Replayer;
 use rcwm_models::bundle::{Bundle, BundleKind, WriteError};
 use rcwm_models::interface::Interface;
 use rcwm_models::onnx::{Graph, ValueInfo, data_type};
+use rcwm_models::tensors::{Tensors, Values};
 use rcwm_models::wire::{Action, ActionSource, ActionValues, OwnedObservation, SimulatorLink, Wait};
 use rcwm_runtime::controller::{Controller, ControllerError, ControllerSettings, Fallback};
 use rcwm_runtime::engine::{EngineKind, available};
@@ -260,4 +261,67 @@ fn an_lstm_of_another_library_becomes_a_bundle_that_gives_that_librarys_numbers(
             assert!(report.failures.is_empty(), "{:?}", report.failures);
         }
     }
+}
+
+#[test]
+fn a_number_that_is_none_is_found_inside_the_graph_though_what_follows_hides_it() {
+    for (operator, measured) in [("Sqrt", 2.0), ("Reciprocal", 1.5), ("Log", 1.5)] {
+        let folder = tempfile::tempdir().unwrap();
+        bundled(folder.path(), policies::diverging(1.5, operator), |_| {}).unwrap();
+        let mut policy = Policy::load(&folder.path().join("bundle"), EngineSettings::tract()).unwrap();
+        policy.observe(seen(&[]), None).unwrap();
+        let state = [measured; 18];
+        let error = policy.observe(Inputs { image: &[], state: &state }, None).unwrap_err();
+        assert!(
+            matches!(error, PolicyError::NotFinite { output: "a value inside", .. }),
+            "{operator}: {error}"
+        );
+        policy.observe(seen(&[]), None).unwrap();
+    }
+}
+
+#[test]
+fn a_cell_keeps_nothing_that_is_not_carried_by_the_runtime() {
+    let folder = tempfile::tempdir().unwrap();
+    // A second episode begins within the golden ticks.
+    let bundle = bundled(folder.path(), policies::gru(), |_| {}).unwrap();
+    for engine in engines() {
+        assert!(verify(&bundle, engine, 1e-5, &mut || {}).unwrap().failures.is_empty());
+    }
+    let mut policy = Policy::load(&folder.path().join("bundle"), EngineSettings::tract()).unwrap();
+    let first = policy.observe(seen(&[]), None).unwrap().action;
+    policy.observe(seen(&[]), Some(&first)).unwrap();
+    policy.warm_caches();
+    assert_eq!(policy.observe(seen(&[]), None).unwrap().action.to_bits(), first.to_bits());
+}
+
+#[test]
+fn actions_that_are_no_shares_of_the_limits_are_refused() {
+    let mut graph = policies::mlp();
+    graph.node.pop();
+    graph.node[2].output[0] = "action".into();
+    let folder = tempfile::tempdir().unwrap();
+    let said = bundled(folder.path(), graph, |_| {}).unwrap_err().to_string();
+    assert!(said.contains("the action reaches") && said.contains("-1 to 1"), "{said}");
+}
+
+#[test]
+fn names_that_are_taken_and_states_that_nothing_carries_are_refused() {
+    let folder = tempfile::tempdir().unwrap();
+    let rename = |request: &mut Request| request.rename = vec![("state".into(), "action".into())];
+    let said = bundled(folder.path(), policies::mlp(), rename).unwrap_err().to_string();
+    assert!(said.contains("--rename state=action"), "{said}");
+    let other = folder.path().join("other.safetensors");
+    let golden = Tensors(std::iter::once(("state.x".to_owned(), values(&[1.0]))).collect());
+    std::fs::write(&other, golden.to_bytes().unwrap()).unwrap();
+    let initial = |request: &mut Request| request.initial = Some(other.clone());
+    let said = bundled(folder.path(), policies::mlp(), initial).unwrap_err().to_string();
+    assert!(said.contains("state.x") && said.contains("no state is carried"), "{said}");
+    let twice = |request: &mut Request| request.inputs = Some(vec!["joint_pos".into(), "joint_pos".into()]);
+    let said = bundled(folder.path(), policies::mlp(), twice).unwrap_err().to_string();
+    assert!(said.contains("joint_pos") && said.contains("twice"), "{said}");
+}
+
+fn values(numbers: &[f32]) -> Values {
+    Values::F32(ndarray::ArrayD::from_shape_vec(vec![numbers.len()], numbers.to_vec()).unwrap())
 }

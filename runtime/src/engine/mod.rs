@@ -173,6 +173,9 @@ pub enum EngineError {
         /// What there is.
         instead: String,
     },
+    /// Somewhere inside a graph stands what is no number, whatever its outputs say.
+    #[error("{part}: a value inside the graph is not finite")]
+    NotFinite { part: PartName },
     /// The bundle does not have the part.
     #[error("the bundle has no {part}")]
     NoPart {

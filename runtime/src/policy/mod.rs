@@ -36,6 +36,7 @@ pub use limits::ActionLimits;
 pub use noise::Sampling;
 
 pub use recurrent::Graph;
+pub(crate) use recurrent::no_half_weights;
 pub use state::{BranchState, State};
 pub use surprise::{NoSuchSurprise, Surprise, SurpriseLimits};
 

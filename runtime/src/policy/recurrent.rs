@@ -111,6 +111,12 @@ impl Camera {
     }
 }
 
+/// Why there are no 16-bit weights.
+pub(crate) fn no_half_weights() -> EngineError {
+    let what = "--half-weights with a bundle of kind recurrent".to_owned();
+    EngineError::Choice { what, instead: "its graph runs as it is; leave it out".to_owned() }
+}
+
 /// The tick of kind `recurrent`.
 pub(super) struct Recurrent {
     graph: Graph,
@@ -122,9 +128,7 @@ pub(super) struct Recurrent {
 impl Recurrent {
     pub(super) fn load(bundle: &Bundle, settings: EngineSettings) -> Result<Self, PolicyError> {
         if settings.has_half_weights() {
-            let what = "--half-weights with a bundle of kind recurrent".to_owned();
-            let instead = "its graph runs as it is; leave it out".to_owned();
-            return Err(EngineError::Choice { what, instead }.into());
+            return Err(no_half_weights().into());
         }
         let manifest = &bundle.manifest;
         let action = ActionValues::zeros(manifest.interface.action_numbers());
@@ -145,7 +149,10 @@ impl Tick for Recurrent {
     fn observe(&mut self, inputs: Inputs<'_>, work: &mut Work<'_>) -> Result<(), PolicyError> {
         let Self { graph, action, .. } = self;
         let Work { state, buffers, clock, .. } = work;
-        graph.run(inputs, action, &state.branches[0].h)?;
+        graph.run(inputs, action, &state.branches[0].h).map_err(|error| match error {
+            EngineError::NotFinite { part } => PolicyError::NotFinite { part, output: "a value inside" },
+            error => error.into(),
+        })?;
         for (output, found) in graph.signature.outputs.iter().zip(&graph.outputs) {
             match output {
                 PolicyOutput::Action => buffers.mean.copy_from_slice(found),

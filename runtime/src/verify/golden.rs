@@ -49,7 +49,11 @@ impl<'a> Golden<'a> {
                 }
             }
         }
-        this.ticks = ticks.into_iter().min().unwrap_or(0);
+        this.ticks = ticks.first().copied().unwrap_or(0);
+        if ticks.iter().any(|rows| *rows != this.ticks) {
+            let (found, expected) = (format!("of {ticks:?} ticks"), "as many ticks of each input".to_owned());
+            return Err(this.wrong(TensorsError::Unexpected { name: "input/*".into(), found, expected }));
+        }
         if this.ticks == 0 {
             return Err(this.wrong(TensorsError::Missing { name: "input/*, at least one tick".into() }));
         }

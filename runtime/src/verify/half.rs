@@ -8,7 +8,7 @@ use super::VerifyError;
 use super::golden::Golden;
 use crate::compile::Optimizations;
 use crate::engine::{EngineKind, EngineSettings, Form};
-use crate::policy::{Buffers, Policy, Sampling};
+use crate::policy::{Buffers, Policy, PolicyError, Sampling, no_half_weights};
 
 /// Ticks that are compared; golden images are shown again and again with fresh noise.
 pub const HALF_TICKS: usize = 1000;
@@ -33,6 +33,9 @@ pub struct HalfReport {
 /// # Errors
 /// What the policy or the golden values say.
 pub fn half_weights(bundle: &Bundle) -> Result<HalfReport, VerifyError> {
+    if bundle.manifest.model.is_none() {
+        return Err(PolicyError::from(no_half_weights()).into());
+    }
     let golden = Golden::of(bundle)?;
     let settings = EngineSettings::single_threaded(EngineKind::Tract);
     let half = Optimizations { half_weights: true, ..Optimizations::EXACT };

@@ -114,3 +114,48 @@ pub fn lstm() -> Graph {
         ..Graph::default()
     }
 }
+
+/// A GRU on the measured state, which carries `state.h` on through the sequence that its cell gives, not through its last state.
+pub fn gru() -> Graph {
+    let carried = [1, 1, HIDDEN];
+    Graph {
+        name: "gru".into(),
+        node: vec![
+            node("Unsqueeze", &["state", "first"], &["x"], vec![]),
+            node(
+                "GRU",
+                &["x", "w", "r", "", "", "state.h"],
+                &["sequence", ""],
+                vec![int("hidden_size", HIDDEN as i64)],
+            ),
+            node("Squeeze", &["sequence", "first"], &["next_state.h"], vec![]),
+            node("Squeeze", &["next_state.h", "first"], &["h"], vec![]),
+            node("MatMul", &["h", "w_out"], &["out"], vec![]),
+            node("Tanh", &["out"], &["action"], vec![]),
+        ],
+        initializer: vec![
+            Tensor::i64("first", &[1], &[0]),
+            weight("w", &[1, 3 * HIDDEN, 18]),
+            weight("r", &[1, 3 * HIDDEN, HIDDEN]),
+            weight("w_out", &[HIDDEN, 4]),
+        ],
+        input: vec![float("state", &[1, 18]), float("state.h", &carried)],
+        output: vec![float("action", &[1, 4]), float("next_state.h", &carried)],
+        ..Graph::default()
+    }
+}
+
+/// The [`mlp`] on an operator of `limit` minus the measured state, with a `Relu` behind it that may hide what is no number.
+pub fn diverging(limit: f32, of_difference: &str) -> Graph {
+    let mut graph = mlp();
+    graph.initializer.push(Tensor::f32("limit", &[], &[limit]));
+    let diverged = node(of_difference, &["difference"], &["diverged"], vec![]);
+    let before = [
+        node("Sub", &["limit", "state"], &["difference"], vec![]),
+        diverged,
+        node("Relu", &["diverged"], &["seen"], vec![]),
+    ];
+    graph.node[0].input[0] = "seen".into();
+    graph.node.splice(0..0, before);
+    graph
+}

@@ -45,7 +45,8 @@ pub(super) fn gather(attributes: &mut Attributes<'_>, inputs: &[&Value]) -> Infe
     Ok(vec![table.reshaped(shape)])
 }
 
-pub(super) fn reshape(inputs: &[&Value]) -> Inferred {
+pub(super) fn reshape(attributes: &mut Attributes<'_>, inputs: &[&Value]) -> Inferred {
+    attributes.only_int("allowzero", 0)?;
     let [x, wanted] = take(inputs)?;
     let wanted = constant_integers(wanted, "the shape")?;
     let invalid = || format!("{:?} cannot become {wanted:?}", x.shape);

@@ -27,7 +27,7 @@ pub(super) fn infer(
         "LogSoftmax" | "Softmax" => softmax(attributes, inputs),
         "Concat" => movement::concat(attributes, inputs),
         "Gather" => movement::gather(attributes, inputs),
-        "Reshape" => movement::reshape(inputs),
+        "Reshape" => movement::reshape(attributes, inputs),
         "Split" => movement::split(attributes, inputs, outputs),
         "Transpose" => movement::transpose(attributes, inputs),
         _ => return policies::infer(operator, attributes, inputs, outputs),
@@ -81,6 +81,7 @@ fn cast(attributes: &mut Attributes<'_>, inputs: &[&Value]) -> Inferred {
 }
 
 fn layer_norm(attributes: &mut Attributes<'_>, inputs: &[&Value]) -> Inferred {
+    attributes.only_int("stash_type", 1)?;
     let [x, scale, bias] = floats(inputs)?;
     let axis = attributes.axis(-1, x.rank())?;
     let width = x.shape[axis];

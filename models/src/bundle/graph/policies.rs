@@ -151,6 +151,7 @@ fn pool(attributes: &mut Attributes<'_>, inputs: &[&Value], averages: bool) -> I
 }
 
 fn reduce_mean(attributes: &mut Attributes<'_>, inputs: &[&Value]) -> Inferred {
+    attributes.only_int("noop_with_empty_axes", 0)?;
     let (x, axes) = match inputs.len() {
         // Operator set 17 has the axes as an attribute.
         1 => (inputs[0], attributes.ints("axes")?.ok_or("attribute \"axes\" is missing")?),
@@ -160,6 +161,9 @@ fn reduce_mean(attributes: &mut Attributes<'_>, inputs: &[&Value]) -> Inferred {
         }
     };
     let [x] = floats(&[x])?;
+    if axes.is_empty() {
+        return Err("no axes: engines differ on what that means".into());
+    }
     let keep = attributes.flag("keepdims", true)?;
     Ok(vec![Value::new(DType::F32, reduced(&x.shape, &distinct(axes, x.rank())?, keep))])
 }

@@ -21,6 +21,9 @@ pub(super) fn rename(graph: &mut Graph, request: &Request) -> Result<(), Bundlin
                 graph.input.iter().chain(&graph.output),
             ));
         }
+        if known_values(graph).any(|name| name == to) {
+            return Err(BundlingError::NameTaken { from: from.clone(), to: to.clone() });
+        }
         rename_value(graph, from, to);
     }
     for (input, output) in &request.carry {
@@ -33,6 +36,11 @@ pub(super) fn rename(graph: &mut Graph, request: &Request) -> Result<(), Bundlin
         rename_value(graph, output, &format!("{CARRIED_NEXT}{input}"));
     }
     Ok(())
+}
+
+fn known_values(graph: &Graph) -> impl Iterator<Item = &String> {
+    let border = graph.input.iter().chain(&graph.output).map(|info| &info.name);
+    border.chain(graph.node.iter().flat_map(|node| &node.output))
 }
 
 fn unknown<'a>(

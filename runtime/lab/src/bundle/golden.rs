@@ -1,10 +1,11 @@
-//! Golden values of a policy whose library is not here: what an engine makes of made-up ticks. A runtime on another machine, or of
-//! another version, is then held against this one.
+//! Golden values of a policy whose library is not here: what ONNX Runtime makes of made-up ticks.
+
+use std::path::Path;
 
 use ndarray::{ArrayD, IxDyn};
 use rcwm_models::bundle::{Bundle, PolicyOutput, PolicySignature};
 use rcwm_models::tensors::{Tensors, Values};
-use rcwm_runtime::engine::{self, EngineKind, EngineSettings, Form};
+use rcwm_runtime::engine::{self, EngineKind, EngineSettings};
 use rcwm_runtime::policy::{Graph, Inputs, PolicyError};
 
 use super::BundlingError;
@@ -22,16 +23,13 @@ impl Rows {
     }
 }
 
-/// Runs the policy for some ticks on moving gradients and swinging numbers, by ONNX Runtime where it is there; gives the values, and in words
-/// where they come from. A second episode begins after two thirds.
-pub(super) fn record(bundle: &Bundle, ticks: usize) -> Result<(Tensors, String), BundlingError> {
+/// Runs the policy for some ticks on moving gradients and swinging numbers, by ONNX Runtime; gives the values, and in words where
+/// they come from. A second episode begins after two thirds.
+pub(super) fn record(bundle: &Bundle, path: &Path, ticks: usize) -> Result<(Tensors, String), BundlingError> {
     let (manifest, ticks) = (&bundle.manifest, ticks.max(1));
-    let tract = EngineSettings::single_threaded(EngineKind::Tract).with_form(Form::Exported);
-    let (settings, engine) = match engine::available(EngineKind::Ort) {
-        Ok(()) => (EngineSettings::ort(1), "ONNX Runtime"),
-        Err(_) => (tract, "tract"),
-    };
-    let mut graph = Graph::load(bundle, settings)?;
+    // Another engine than that which is deployed: what that one gets wrong would be right by itself.
+    engine::available(EngineKind::Ort).map_err(BundlingError::NoGolden)?;
+    let mut graph = Graph::load(bundle, EngineSettings::ort(1))?;
     let signature = PolicySignature::of(manifest, &manifest.parts[0]).map_err(PolicyError::from)?;
     let initial = &bundle.initial.branches[0].h;
     let (mut carried, mut rows, mut tensors) = (initial.clone(), Rows::default(), Tensors::default());
@@ -58,6 +56,10 @@ pub(super) fn record(bundle: &Bundle, ticks: usize) -> Result<(Tensors, String),
         for ((output, spec), found) in
             signature.outputs.iter().zip(&manifest.parts[0].outputs).zip(graph.outputs())
         {
+            if found.iter().any(|x| !x.is_finite()) {
+                let (path, name) = (path.to_path_buf(), spec.name.clone());
+                return Err(BundlingError::NotFinite { path, name, tick });
+            }
             rows.push(format!("expect/policy/{}", spec.name), &spec.shape, found);
             if let PolicyOutput::Carried(range) = output {
                 carried[range.clone()].copy_from_slice(found);
@@ -77,7 +79,7 @@ pub(super) fn record(bundle: &Bundle, ticks: usize) -> Result<(Tensors, String),
         tensors.0.insert(format!("input/{name}"), Values::U8(array(shaped(&shape), values)));
     }
     tensors.0.insert("input/is_first".into(), Values::U8(array(shaped(&[]), first)));
-    Ok((tensors, format!("golden values: {ticks} made-up ticks, computed by {engine}")))
+    Ok((tensors, format!("golden values: {ticks} made-up ticks, computed by ONNX Runtime")))
 }
 
 fn array<T>(shape: IxDyn, values: Vec<T>) -> ArrayD<T> {

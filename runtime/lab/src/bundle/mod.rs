@@ -16,7 +16,7 @@ use rcwm_models::files::{FileError, read_capped, sha256_hex};
 use rcwm_models::interface::Interface;
 use rcwm_models::onnx::{self, OnnxError};
 use rcwm_models::tensors::{Tensors, TensorsError, Values};
-use rcwm_runtime::engine::{EngineKind, EngineSettings};
+use rcwm_runtime::engine::{EngineError, EngineKind, EngineSettings};
 use rcwm_runtime::policy::PolicyError;
 use rcwm_runtime::verify::{VerifyError, verify};
 
@@ -24,6 +24,8 @@ use rcwm_runtime::verify::{VerifyError, verify};
 const TENSORS_BYTES_MAX: u64 = 32 << 20;
 /// Largest error of an output against its golden values.
 const TOLERANCE: f32 = 1e-5;
+/// By how much an action may be beyond -1 and 1, for rounding.
+const BEYOND_ONE: f32 = 1e-3;
 
 /// Why there is no bundle.
 #[derive(Debug, thiserror::Error)]
@@ -50,9 +52,26 @@ pub enum BundlingError {
     /// Initial states or golden values are unusable.
     #[error("{path}: {source}")]
     Tensors { path: PathBuf, source: TensorsError },
-    /// Something that no input takes.
-    #[error("{path}: tensor {name:?} is not carried by the policy, which carries: {carried}; leave it out")]
-    NotCarried { path: PathBuf, name: String, carried: String },
+    /// There is nothing to hold the policy against.
+    #[error(
+        "golden values are missing: {0}. Or give the policy's own with --golden FILE: without either, an engine would be held against \
+         itself"
+    )]
+    NoGolden(EngineError),
+    /// The policy's actions are no shares of the limits.
+    #[error(
+        "{path}: the action reaches {found}, expected -1 to 1, from the interface's low to its high; normalise it, or end the graph with \
+         Tanh or Clip"
+    )]
+    BeyondLimits { path: PathBuf, found: f32 },
+    /// The policy gives what is no number.
+    #[error("{path}: {name} is not finite at tick {tick} of the made-up ticks")]
+    NotFinite { path: PathBuf, name: String, tick: usize },
+    /// A new name that another value has.
+    #[error(
+        "--rename {from}={to}: the graph has a value {to:?} already; rename that one first, or choose another name"
+    )]
+    NameTaken { from: String, to: String },
     /// The policy does not run on what it would be given.
     #[error(transparent)]
     Policy(#[from] PolicyError),
@@ -141,8 +160,13 @@ pub fn build(request: &Request, place: &Path) -> Result<Bundle, BundlingError> {
     let bundle = new.check(&manifest)?;
     let (golden, words) = match &request.golden {
         Some(path) => (read(path)?, format!("golden values: {}", name_of(path))),
-        None => golden::record(&bundle, request.golden_ticks)?,
+        None => golden::record(&bundle, &request.onnx, request.golden_ticks)?,
     };
+    if let Ok(actions) = golden.f32("expect/policy/action")
+        && let Some(found) = actions.iter().find(|x| x.abs() > 1.0 + BEYOND_ONE)
+    {
+        return Err(BundlingError::BeyondLimits { path: request.onnx.clone(), found: *found });
+    }
     manifest.provenance.data += &format!("; {words}");
     manifest.golden = new.file("golden.safetensors", &to_bytes(&golden)?)?;
     let bundle = new.check(&manifest)?;
@@ -164,13 +188,7 @@ pub fn build(request: &Request, place: &Path) -> Result<Bundle, BundlingError> {
 /// What every episode starts from: as asked, or zeros.
 fn initial(request: &Request, signature: &PolicySignature) -> Result<Tensors, BundlingError> {
     if let Some(path) = &request.initial {
-        let tensors = read(path)?;
-        let names: Vec<&str> = signature.carried.iter().map(|spec| spec.name.as_str()).collect();
-        if let Some(name) = tensors.0.keys().find(|name| !names.contains(&name.as_str())) {
-            let (name, carried) = (name.clone(), names.join(", "));
-            return Err(BundlingError::NotCarried { path: path.clone(), name, carried });
-        }
-        return Ok(tensors);
+        return read(path);
     }
     let zeros = |spec: &TensorSpec| (spec.name.clone(), Values::F32(ArrayD::zeros(IxDyn(&spec.shape))));
     Ok(Tensors(signature.carried.iter().map(zeros).collect()))
