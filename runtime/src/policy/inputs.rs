@@ -72,30 +72,50 @@ impl InputReader {
             self.places = Some((Arc::clone(format), found));
         }
         let (_, places) = self.places.as_ref()?;
-        self.state.clear();
-        for range in &places.states {
-            self.state.extend_from_slice(&observation.state()[range.clone()]);
-        }
-        if let [camera] = places.cameras[..] {
-            return Some(Inputs { image: observation.image(camera), state: &self.state });
-        }
-        if !self.side_by_side {
-            self.image.clear();
-            for camera in &places.cameras {
-                self.image.extend_from_slice(observation.image(*camera));
-            }
-            return Some(Inputs { image: &self.image, state: &self.state });
-        }
-        self.image.resize(places.cameras.iter().map(|camera| observation.image(*camera).len()).sum(), 0);
-        let cameras = places.cameras.len();
-        for (at, camera) in places.cameras.iter().enumerate() {
-            let pixels = observation.image(*camera).as_chunks::<3>().0.iter();
-            for (to, pixel) in self.image.chunks_exact_mut(3).skip(at).step_by(cameras).zip(pixels) {
-                to.copy_from_slice(pixel);
-            }
-        }
-        Some(Inputs { image: &self.image, state: &self.state })
+        let cameras = places.cameras.iter().map(|camera| observation.image(*camera));
+        let states = places.states.iter().map(|range| &observation.state()[range.clone()]);
+        Some(laid_out(&mut self.image, &mut self.state, self.side_by_side, cameras, states))
     }
+
+    /// Inputs of pictures and states that are given in the order of the bundle's `policy.inputs`; [`Policy::observe`] looks at their sizes.
+    pub fn arrange<'a>(
+        &'a mut self,
+        cameras: impl ExactSizeIterator<Item = &'a [u8]> + Clone,
+        states: impl Iterator<Item = &'a [f32]>,
+    ) -> Inputs<'a> {
+        laid_out(&mut self.image, &mut self.state, self.side_by_side, cameras, states)
+    }
+}
+
+/// One camera's picture is taken where it lies; all else is put together in memory that was allocated at the first tick.
+fn laid_out<'a>(
+    image: &'a mut Vec<u8>,
+    state: &'a mut Vec<f32>,
+    side_by_side: bool,
+    mut cameras: impl ExactSizeIterator<Item = &'a [u8]> + Clone,
+    states: impl Iterator<Item = &'a [f32]>,
+) -> Inputs<'a> {
+    state.clear();
+    states.for_each(|numbers| state.extend_from_slice(numbers));
+    let count = cameras.len();
+    if count == 1
+        && let Some(only) = cameras.next()
+    {
+        return Inputs { image: only, state };
+    }
+    image.clear();
+    if !side_by_side {
+        cameras.for_each(|camera| image.extend_from_slice(camera));
+        return Inputs { image, state };
+    }
+    image.resize(cameras.clone().map(<[u8]>::len).sum(), 0);
+    for (at, camera) in cameras.enumerate() {
+        let pixels = camera.as_chunks::<3>().0.iter();
+        for (to, pixel) in image.chunks_exact_mut(3).skip(at).step_by(count).zip(pixels) {
+            to.copy_from_slice(pixel);
+        }
+    }
+    Inputs { image, state }
 }
 
 impl Policy {
