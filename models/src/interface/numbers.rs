@@ -5,7 +5,7 @@ use super::{Action, ActionMode, Fallback, FallbackRule, Interface};
 /// What a number of an action is where there is no decision.
 #[derive(Debug, Clone, Copy, PartialEq, Default)]
 pub enum Safe {
-    /// What was executed last.
+    /// The position that was commanded last.
     #[default]
     Hold,
     /// What was measured last.
@@ -34,13 +34,18 @@ impl Interface {
     pub fn numbers(&self) -> Vec<ActionNumber> {
         let of = |action: &Action| {
             let measured = action.measured.as_deref().and_then(|name| self.state_range(name));
+            let is_absolute = action.mode == ActionMode::Absolute;
             let number = |at: usize| ActionNumber {
                 low: action.low[at] as f32,
                 high: action.high[at] as f32,
                 rate_max: action.rate_max.map_or(f32::INFINITY, |most| most as f32),
-                is_absolute: action.mode == ActionMode::Absolute,
+                is_absolute,
                 safe: match &action.fallback {
-                    Fallback::Rule(FallbackRule::Hold) => Safe::Hold,
+                    Fallback::Rule(FallbackRule::Hold) if is_absolute => Safe::Hold,
+                    // The last change, once more, would move on: a robot that holds changes as little as it can.
+                    Fallback::Rule(FallbackRule::Hold) => {
+                        Safe::Number(0.0_f32.clamp(action.low[at] as f32, action.high[at] as f32))
+                    }
                     Fallback::Rule(FallbackRule::HoldMeasured) => Safe::HoldMeasured,
                     Fallback::Rule(FallbackRule::Zero) => Safe::Number(0.0),
                     Fallback::Numbers(numbers) => Safe::Number(numbers[at] as f32),

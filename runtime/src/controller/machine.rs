@@ -39,7 +39,7 @@ pub enum State {
 pub enum Cause {
     /// No observation came.
     Silence,
-    /// An observation held a number that is not finite.
+    /// An observation held a number that is not finite, or an executed action beyond the limits.
     Observation,
     /// The policy gave a number that is not finite.
     Output,
@@ -57,7 +57,9 @@ impl std::fmt::Display for Cause {
     fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
         f.write_str(match self {
             Self::Silence => "no observation came",
-            Self::Observation => "the observations hold numbers that are not finite",
+            Self::Observation => {
+                "the observations hold numbers that are not finite, or an executed action beyond the limits"
+            }
             Self::Output => "the policy gives numbers that are not finite",
             Self::Engine => "the engine fails",
             Self::RobotSurprise => "the robot's surprise is over its limit",

@@ -186,6 +186,11 @@ impl SimulatorLink {
     /// # Errors
     /// [`LinkError::Traffic`].
     pub fn close(self) -> Result<(), LinkError> {
+        self.say_closed()
+    }
+
+    /// The same, by who has something to do yet.
+    pub(in crate::wire) fn say_closed(&self) -> Result<(), LinkError> {
         self.observations.notify(EVENT_CLOSED)
     }
 }

@@ -3,7 +3,7 @@
 use crate::interface::{ActionNumber, Interface, Safe};
 use crate::wire::ActionValues;
 
-/// Holds what was executed last; all actions are in the interface's units.
+/// Holds what was executed last; all actions are in the interface's units. What is chosen counts only once it was [executed](Self::executed).
 #[derive(Debug, Clone)]
 pub struct Guard {
     numbers: Vec<ActionNumber>,
@@ -46,11 +46,11 @@ impl Guard {
         if self.last.is_finite() { self.last } else { ActionValues::zeros(self.last.len()) }
     }
 
-    /// What is executed of an answer: itself, changed by no more than `rate_max`.
+    /// What is to be executed of an answer: itself, changed by no more than `rate_max`.
     ///
     /// # Errors
-    /// Why nothing of it is executed.
-    pub fn accept(&mut self, action: &[f32]) -> Result<ActionValues, Refused> {
+    /// Why nothing of it is.
+    pub fn accept(&self, action: &[f32]) -> Result<ActionValues, Refused> {
         if action.len() != self.numbers.len() {
             return Err(Refused::Length);
         }
@@ -65,39 +65,47 @@ impl Guard {
         if !self.numbers.iter().zip(action).all(is_near) {
             return Err(Refused::OutOfLimits);
         }
-        self.commanded = true;
-        self.last = ActionValues::from_fn(action.len(), |at| {
-            let (number, last) = (&self.numbers[at], self.last[at]);
-            let near = if last.is_nan() {
-                action[at]
-            } else {
-                action[at].clamp(last - number.rate_max, last + number.rate_max)
-            };
+        Ok(ActionValues::from_fn(action.len(), |at| {
             // Limits come last: a robot may have been moved beyond them.
-            near.clamp(number.low, number.high)
-        });
-        Ok(self.last)
+            self.near(at, action[at]).clamp(self.numbers[at].low, self.numbers[at].high)
+        }))
     }
 
-    /// The interface's safe action for a measured state; none where it is to hold what is not known.
-    pub fn rest(&mut self, state: &[f32]) -> Option<ActionValues> {
-        let (last, commanded) = (self.last, self.commanded);
-        let safe = |at: usize, number: &ActionNumber| match number.safe {
-            Safe::Number(safe) => safe,
-            Safe::Hold if commanded => last[at],
+    /// No farther from what was executed last than may be.
+    fn near(&self, at: usize, wanted: f32) -> f32 {
+        let (last, most) = (self.last[at], self.numbers[at].rate_max);
+        if last.is_nan() { wanted } else { wanted.clamp(last - most, last + most) }
+    }
+
+    /// The interface's safe action for a measured state; none where it is to hold what is not known. A place to drive to is driven to no
+    /// faster than `rate_max`.
+    #[must_use]
+    pub fn rest(&self, state: &[f32]) -> Option<ActionValues> {
+        let held = |at: usize| if self.commanded { self.last[at] } else { f32::NAN };
+        let safe = |(at, number): (usize, &ActionNumber)| match number.safe {
+            Safe::Number(safe) => self.near(at, safe),
+            Safe::Hold if self.commanded => self.last[at],
             // What was executed last is the next best.
-            Safe::Hold | Safe::HoldMeasured => {
-                measured(number, state).unwrap_or(if commanded { last[at] } else { f32::NAN })
-            }
+            Safe::Hold | Safe::HoldMeasured => measured(number, state).unwrap_or_else(|| held(at)),
         };
-        let rest: ActionValues =
-            self.numbers.iter().enumerate().map(|(at, number)| safe(at, number)).collect();
-        if !rest.is_finite() {
-            return None;
-        }
-        self.commanded = true;
-        self.last = self.each_of(&rest, |number, rest| rest.clamp(number.low, number.high));
-        Some(self.last)
+        let rest: ActionValues = self.numbers.iter().enumerate().map(safe).collect();
+        rest.is_finite().then(|| self.within(&rest))
+    }
+
+    /// Whether a robot that has executed this still moves by its last command: a change or a velocity on its way to rest.
+    #[must_use]
+    pub fn still_moves(&self, action: &ActionValues) -> bool {
+        let moves = |(number, x): (&ActionNumber, &f32)| match number.safe {
+            Safe::Number(safe) => !number.is_absolute && *x != safe.clamp(number.low, number.high),
+            Safe::Hold | Safe::HoldMeasured => false,
+        };
+        self.numbers.iter().zip(action.iter()).any(moves)
+    }
+
+    /// The same within the limits.
+    #[must_use]
+    pub fn within(&self, action: &ActionValues) -> ActionValues {
+        self.numbers.iter().zip(action.iter()).map(|(number, x)| x.clamp(number.low, number.high)).collect()
     }
 
     /// What the robot has made of the action that it was given.
@@ -111,16 +119,12 @@ impl Guard {
         if !action.is_finite() {
             return Err(Refused::NotFinite);
         }
-        self.last = *action;
+        (self.last, self.commanded) = (*action, true);
         Ok(())
     }
 
     fn each(&self, of: impl Fn(&ActionNumber) -> f32) -> ActionValues {
         self.numbers.iter().map(of).collect()
-    }
-
-    fn each_of(&self, action: &ActionValues, of: impl Fn(&ActionNumber, f32) -> f32) -> ActionValues {
-        self.numbers.iter().zip(action.iter()).map(|(number, x)| of(number, *x)).collect()
     }
 }
 
@@ -141,7 +145,9 @@ mod tests {
     fn an_arm_starts_from_where_it_is_measured_and_moves_no_faster_than_it_may() {
         let mut guard = arm();
         assert_eq!(guard.begin(&[0.5, -0.25]), [0.5, -0.25]);
-        assert_eq!(guard.accept(&[1.0, -0.26]).unwrap(), [0.55, -0.26]);
+        let first = guard.accept(&[1.0, -0.26]).unwrap();
+        assert_eq!(first, [0.55, -0.26]);
+        guard.executed(&first).unwrap();
         assert_eq!(guard.accept(&[0.56, -0.26]).unwrap(), [0.56, -0.26]);
     }
 
@@ -168,13 +174,58 @@ mod tests {
     fn it_rests_where_the_interface_says() {
         let mut guard = arm();
         guard.begin(&[0.0, 0.0]);
-        guard.accept(&[0.05, 0.05]).unwrap();
+        guard.executed(&[0.05, 0.05].into()).unwrap();
         assert_eq!(guard.rest(&[0.03, 0.02]).unwrap(), [0.03, 0.02]);
-        assert_eq!(guard.rest(&[f32::NAN, 0.01]).unwrap(), [0.03, 0.01], "what is not measured now");
+        assert_eq!(guard.rest(&[f32::NAN, 0.01]).unwrap(), [0.05, 0.01], "what is not measured now");
         assert!(arm().rest(&[f32::NAN, 0.0]).is_none(), "what is not known cannot be held");
         let mut hand = Guard::new(&Interface::metaworld());
         hand.begin(&[0.0; 18]);
-        hand.accept(&[0.5; 4]).unwrap();
+        hand.executed(&[0.5; 4].into()).unwrap();
         assert_eq!(hand.rest(&[0.0; 18]).unwrap(), [0.0; 4]);
+    }
+
+    /// One number from -2 to 2 with a fallback of its own, measured.
+    fn one(mode: &str, fallback: &str) -> Guard {
+        let text = format!(
+            "[interface]\nname = \"one\"\nrate_hz = 40.0\n[[interface.state]]\nname = \"at\"\nkind = \"state/joint/{what}\"\n\
+             elements = [\"j\"]\nunit = \"{unit}\"\n[[interface.camera]]\nname = \"front\"\nshape = [64, 64, 3]\nencoding = \"rgb8\"\n\
+             [[interface.action]]\nname = \"arm\"\nkind = \"command/joint/{what}\"\nmode = \"{mode}\"\nelements = [\"j\"]\n\
+             unit = \"{unit}\"\nlow = [-2.0]\nhigh = [2.0]\nrate_max = 0.25\nmeasured = \"at\"\nfallback = {fallback}\n",
+            what = if mode == "velocity" { "velocity" } else { "position" },
+            unit = if mode == "velocity" { "rad/s" } else { "rad" },
+        );
+        Guard::new(&Interface::parse(&text).unwrap())
+    }
+
+    #[test]
+    fn what_holds_a_change_or_a_velocity_stands_still() {
+        for mode in ["delta", "velocity"] {
+            let mut guard = one(mode, "\"hold\"");
+            guard.begin(&[1.0]);
+            assert_eq!(guard.rest(&[1.0]).unwrap(), [0.0], "{mode}: nothing was commanded");
+            guard.executed(&[1.5].into()).unwrap();
+            assert_eq!(
+                guard.rest(&[1.0]).unwrap(),
+                [1.25],
+                "{mode}: on its way to 0, by no more than rate_max"
+            );
+        }
+    }
+
+    #[test]
+    fn a_safe_place_is_driven_to_no_faster_than_may_be() {
+        let mut guard = one("absolute", "[0.0]");
+        guard.begin(&[1.0]);
+        guard.executed(&[1.25].into()).unwrap();
+        assert_eq!(guard.rest(&[1.2]).unwrap(), [1.0]);
+    }
+
+    #[test]
+    fn what_a_robot_would_not_execute_is_not_held() {
+        let mut guard = one("absolute", "\"hold\"");
+        guard.begin(&[1.0]);
+        guard.executed(&[1.0].into()).unwrap();
+        guard.accept(&[1.2]).unwrap();
+        assert_eq!(guard.rest(&[1.1]).unwrap(), [1.0], "it failed, and 1.2 was never executed");
     }
 }

@@ -1,8 +1,8 @@
 //! A robot of your own on the wire: [`serve`] keeps its time, asks the controller, and looks after what may be executed.
 //!
 //! In lock-step every observation waits for its answer. In real time an episode begins to run with its first answer: from then on an
-//! observation goes out every period of the interface, and a tick without an answer executes the interface's safe action. So does an answer
-//! that is not finite, out of limits or of another length; all of it is counted. `rcwm.gym` does the same in Python.
+//! observation goes out every period of the interface, and a tick without an answer in time executes the interface's safe action. So does an
+//! answer that is not finite or out of limits; one of another length is none. All of it is counted. `rcwm.gym` does the same in Python.
 
 mod guard;
 #[cfg(test)]
@@ -25,20 +25,21 @@ pub type RobotError = Box<dyn std::error::Error + Send + Sync>;
 
 /// A robot, or a simulator of one.
 pub trait Robot {
-    /// Goes to where an episode starts. What was executed last may still be going on.
+    /// Goes to where an episode starts. The robot has been given its safe action.
     ///
     /// # Errors
     /// The robot's own.
     fn reset(&mut self, episode: u64) -> Result<(), RobotError>;
 
     /// Fills in pictures, masks, states, capture stamps, and the reward of the last step; of the flags SUCCESS and MASK_VALID, and LAST
-    /// and TERMINAL where the episode ends. All else is filled in already.
+    /// and TERMINAL where the episode ends. All else is filled in already. While an episode has not begun to run, it is asked again and again.
     ///
     /// # Errors
     /// The robot's own.
     fn observe(&mut self, observation: &mut ObservationMut<'_>) -> Result<(), RobotError>;
 
     /// Begins to execute an action, in the interface's units and within its limits. Gives what is really executed, which may be another.
+    /// After the last observation of an episode, and whatever else ends it, that is the safe action.
     ///
     /// # Errors
     /// The robot's own.
@@ -88,18 +89,27 @@ pub enum ServeError {
     Link(#[from] LinkError),
     #[error("the robot failed in episode {episode}: {source}")]
     Robot { episode: u64, source: RobotError },
-    #[error("no answer within {timeout_s} s: is a controller running on this instance?")]
-    NoAnswer { timeout_s: f64 },
+    #[error(
+        "no answer within {timeout_s} s ({refused} of another length, {stale} to something else): is a controller running on this instance?"
+    )]
+    NoAnswer { timeout_s: f64, refused: u64, stale: u64 },
     #[error("the robot measured a number that is not finite at step {step} of episode {episode}")]
     NotFinite { episode: u64, step: u32 },
     #[error(
         "the robot is to hold what is neither commanded nor measured: give the action `measured`, or a safe action"
     )]
     NoRest,
+    /// Something ended it, and the safe action failed, too.
+    #[error("{cause}; and then the robot could not be brought to rest: {rest}")]
+    Unrested { cause: Box<ServeError>, rest: Box<ServeError> },
 }
 
 /// Longest wait before `stop` is looked at.
 const WAIT_SLICE: Duration = Duration::from_millis(100);
+/// Of a period: what a controller is left at least, and by how much an answer may be late.
+const SHARE_MIN: u64 = 10;
+/// Actions by which a robot comes to rest that may change its command only slowly, at most.
+const REST_ACTIONS_MAX: u32 = 200;
 
 /// Serves whole episodes, or until `stop` is set. However that ends, the controller has been told and the robot was given its safe action.
 ///
@@ -121,21 +131,27 @@ pub fn serve(
         stop,
         served: Served::default(),
         work_ns: 0,
-        runs: false,
+        moves: false,
     };
     // A panic of the robot's program is caught until both are told, and then goes on.
     let served_all = || (0..settings.episodes).try_for_each(|episode| loop_.episode(episode));
     let result = catch_unwind(AssertUnwindSafe(served_all));
     // The controller first, then the robot: neither is left with the last command.
-    let Loop { robot, mut guard, observation, link, served, runs, .. } = loop_;
-    let closed = link.close();
-    let rest = if runs { guard.rest(observation.view().state()) } else { None };
-    let rested = rest.map_or(Ok(()), |rest| robot.execute(&rest).map(drop));
+    let closed = loop_.link.say_closed();
+    let rested = catch_unwind(AssertUnwindSafe(|| loop_.come_to_rest()));
     // What ended the loop comes first.
-    result.unwrap_or_else(|panic| resume_unwind(panic))?;
-    rested.map_err(|source| ServeError::Robot { episode: served.episodes, source })?;
+    match (
+        result.unwrap_or_else(|panic| resume_unwind(panic)),
+        rested.unwrap_or_else(|panic| resume_unwind(panic)),
+    ) {
+        (Ok(()), rested) => rested?,
+        (Err(cause), Ok(())) => return Err(cause),
+        (Err(cause), Err(rest)) => {
+            return Err(ServeError::Unrested { cause: cause.into(), rest: rest.into() });
+        }
+    }
     closed?;
-    Ok(served)
+    Ok(loop_.served)
 }
 
 struct Loop<'a> {
@@ -148,10 +164,20 @@ struct Loop<'a> {
     stop: &'a AtomicBool,
     served: Served,
     period_ns: u64,
-    /// What the robot takes to execute and to observe; forgets slowly.
+    /// What the robot takes to execute; forgets slowly.
     work_ns: u64,
-    /// In the middle of an episode.
-    runs: bool,
+    /// It was given an action since it was last brought to rest.
+    moves: bool,
+}
+
+/// An observation, as the loop has it.
+#[derive(Clone, Copy)]
+struct Seen {
+    episode: u64,
+    step: u32,
+    /// What was executed, and whether that was nobody's answer.
+    before: Option<(ActionValues, bool)>,
+    due_ns: Option<u64>,
 }
 
 impl Loop<'_> {
@@ -163,8 +189,7 @@ impl Loop<'_> {
         if self.stopped() {
             return Ok(());
         }
-        let failed = |source| ServeError::Robot { episode, source };
-        self.robot.reset(episode).map_err(failed)?;
+        self.robot.reset(episode).map_err(|source| ServeError::Robot { episode, source })?;
         let (mut executed, mut held) = (ActionValues::default(), false);
         // None before the first answer: until then time stands still.
         let mut due_ns = None;
@@ -173,15 +198,17 @@ impl Loop<'_> {
             if let Some(due_ns) = &mut due_ns {
                 *due_ns = self.next_tick(*due_ns);
             }
-            let begun = Instant::now();
-            let flags = self.observe(episode, step, (step > 0).then_some((&executed, held)), due_ns)?;
-            self.work(begun.elapsed());
+            let seen = Seen { episode, step, before: (step > 0).then_some((executed, held)), due_ns };
+            let flags = self.observe(&seen)?;
             succeeded |= flags & ObservationFlags::SUCCESS.0 != 0;
             let is_last = flags & ObservationFlags::LAST.0 != 0;
-            self.runs = !is_last;
+            if is_last {
+                // Nothing more is answered: whatever moves by its last command would go on.
+                self.come_to_rest()?;
+            }
             let answer = match due_ns {
                 Some(due_ns) => self.answer_by(due_ns)?,
-                None => self.first_answer()?,
+                None => self.first_answer(&seen)?,
             };
             if self.stopped() {
                 return Ok(());
@@ -193,27 +220,50 @@ impl Loop<'_> {
             if is_last {
                 break;
             }
-            let begun = Instant::now();
             let action;
             (action, held) = self.choose(answer)?;
-            executed = self.robot.execute(&action).map_err(failed)?;
-            self.guard.executed(&executed).map_err(|why| failed(why.into()))?;
-            self.work(begun.elapsed());
+            executed = self.execute(&action, episode)?;
         }
         self.served.episodes += 1;
         self.served.successes += u64::from(succeeded);
         Ok(())
     }
 
-    /// Publishes what is seen now, and gives its flags. `before` is what was executed, and whether that was nobody's answer.
-    fn observe(
-        &mut self,
-        episode: u64,
-        step: u32,
-        before: Option<(&ActionValues, bool)>,
-        due_ns: Option<u64>,
-    ) -> Result<u32, ServeError> {
-        let now_ns = monotonic_ns();
+    /// Gives what the robot has made of it, within the limits: beyond them no observation may say that it was.
+    fn execute(&mut self, action: &ActionValues, episode: u64) -> Result<ActionValues, ServeError> {
+        let begun = Instant::now();
+        self.moves = true;
+        let failed = |source| ServeError::Robot { episode, source };
+        let executed = self.robot.execute(action).map_err(failed)?;
+        self.guard.executed(&executed).map_err(|why| failed(why.into()))?;
+        let took = begun.elapsed().as_nanos() as u64;
+        self.work_ns = took.max(self.work_ns - self.work_ns / 16);
+        Ok(self.guard.within(&executed))
+    }
+
+    /// The safe action, where the robot may still move by another one; once more as long as it may not change its command at once.
+    fn come_to_rest(&mut self) -> Result<(), ServeError> {
+        for _ in 0..REST_ACTIONS_MAX {
+            if !self.moves {
+                break;
+            }
+            let Some(rest) = self.guard.rest(self.observation.view().state()) else {
+                return Err(ServeError::NoRest);
+            };
+            self.execute(&rest, self.served.episodes)?;
+            self.moves = self.guard.still_moves(&rest);
+            if self.moves && self.settings.realtime {
+                std::thread::sleep(Duration::from_nanos(self.period_ns));
+            }
+        }
+        self.moves = false;
+        Ok(())
+    }
+
+    /// Publishes what is seen now, and gives its flags.
+    fn observe(&mut self, seen: &Seen) -> Result<u32, ServeError> {
+        let Seen { episode, step, before, due_ns } = *seen;
+        let begun_ns = monotonic_ns();
         let period_ns = if self.settings.realtime { self.period_ns } else { 0 };
         let mut observation = self.observation.edit();
         *observation = ObservationHeader {
@@ -221,15 +271,16 @@ impl Loop<'_> {
             episode,
             step,
             task: crate::tasks::OWN_TASK,
-            scheduled_ns: due_ns.unwrap_or(now_ns),
             period_ns,
             ..ObservationHeader::zeroed()
         };
         let cameras = self.link.format().interface().camera.len();
-        observation.captured_ns[..cameras].fill(now_ns);
+        observation.captured_ns[..cameras].fill(begun_ns);
         self.robot.observe(&mut observation).map_err(|source| ServeError::Robot { episode, source })?;
+        // Before time runs, an observation is due when it is there.
+        observation.scheduled_ns = due_ns.unwrap_or_else(monotonic_ns);
         let executed = match before {
-            Some((executed, _)) => *executed,
+            Some((executed, _)) => executed,
             None => self.guard.begin(observation.view().state()),
         };
         observation.executed().copy_from_slice(&executed);
@@ -248,16 +299,27 @@ impl Loop<'_> {
         Ok(flags)
     }
 
-    /// Waits until somebody answers, or `stop`.
-    fn first_answer(&mut self) -> Result<Option<Action>, ServeError> {
+    /// Waits until somebody answers, or `stop`. A controller passes over what was due long ago: while time stands still in real time, what
+    /// is seen is seen and said anew.
+    fn first_answer(&mut self, seen: &Seen) -> Result<Option<Action>, ServeError> {
         let start = Instant::now();
+        let slice = if self.settings.realtime {
+            WAIT_SLICE.min(Duration::from_nanos(self.period_ns))
+        } else {
+            WAIT_SLICE
+        };
         while !self.stopped() {
             let left = self.settings.timeout.saturating_sub(start.elapsed());
             if left.is_zero() {
-                return Err(ServeError::NoAnswer { timeout_s: self.settings.timeout.as_secs_f64() });
+                let Served { refused, stale_answers: stale, .. } = self.served;
+                let timeout_s = self.settings.timeout.as_secs_f64();
+                return Err(ServeError::NoAnswer { timeout_s, refused, stale });
             }
-            if let Some(answer) = self.wait(left.min(WAIT_SLICE))? {
+            if let Some(answer) = self.wait(left.min(slice))? {
                 return Ok(Some(answer));
+            }
+            if self.settings.realtime {
+                self.observe(seen)?;
             }
         }
         Ok(None)
@@ -265,13 +327,17 @@ impl Loop<'_> {
 
     /// What comes early enough to be executed before the next observation is due.
     fn answer_by(&mut self, due_ns: u64) -> Result<Option<Action>, ServeError> {
-        let until_ns = due_ns + self.period_ns.saturating_sub(self.work_ns).max(self.period_ns / 10);
+        let room_ns = self.period_ns / SHARE_MIN;
+        // However late the observation was, a controller gets a moment.
+        let until_ns = (due_ns + self.period_ns.saturating_sub(self.work_ns)).max(monotonic_ns() + room_ns);
         while !self.stopped() {
             let left = Duration::from_nanos(until_ns.saturating_sub(monotonic_ns()));
-            if let Some(answer) = self.wait(left.min(WAIT_SLICE))? {
-                return Ok(Some(answer));
+            let answer = self.wait(left.min(WAIT_SLICE))?;
+            if answer.is_some() && monotonic_ns() <= until_ns + room_ns {
+                return Ok(answer);
             }
-            if left.is_zero() {
+            // It came, but this program was stopped meanwhile: it says what was right then.
+            if answer.is_some() || left.is_zero() {
                 self.served.missed_answers += 1;
                 break;
             }
@@ -313,10 +379,6 @@ impl Loop<'_> {
         self.served.rests += 1;
         let rest = self.guard.rest(self.observation.view().state());
         Ok((rest.ok_or(ServeError::NoRest)?, true))
-    }
-
-    fn work(&mut self, took: Duration) {
-        self.work_ns = (took.as_nanos() as u64).max(self.work_ns - self.work_ns / 16);
     }
 
     /// Waits for the next tick; ticks that are past are left out and counted.

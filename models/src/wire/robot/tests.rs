@@ -11,6 +11,8 @@ struct Joints {
     heavy: bool,
     executed: Vec<ActionValues>,
     fails_at: Option<usize>,
+    fails_from: Option<usize>,
+    takes: Option<Duration>,
     panics_at: Option<usize>,
     measures: Option<f32>,
 }
@@ -32,7 +34,9 @@ impl Robot for Joints {
 
     fn execute(&mut self, action: &ActionValues) -> Result<ActionValues, RobotError> {
         self.executed.push(*action);
-        if self.fails_at == Some(self.executed.len()) {
+        self.takes.into_iter().for_each(std::thread::sleep);
+        let count = self.executed.len();
+        if self.fails_at == Some(count) || self.fails_from.is_some_and(|from| count >= from) {
             return Err("the brakes are on".into());
         }
         assert_ne!(self.panics_at, Some(self.executed.len()), "a fault of the robot's program");
@@ -88,6 +92,49 @@ fn whole_episodes_are_served_and_what_was_really_executed_is_told() {
     assert_eq!(told[0], (0, vec![0.5, -0.5]));
     assert!((told[1].1[0] - 0.52).abs() < 1e-6, "half of what it was told: {told:?}");
     assert_eq!(told[4], (4, vec![0.5, -0.5]));
+    // Three answers an episode, and after its last observation the safe action: where it stands.
+    assert_eq!(robot.executed.len(), 8);
+    assert!((robot.executed[3][0] - 0.56).abs() < 1e-6, "{:?}", robot.executed);
+    assert_eq!(robot.executed[3], robot.executed[7]);
+}
+
+#[test]
+fn a_controller_that_comes_late_in_real_time_is_shown_what_is_seen_now() {
+    let (link_settings, _domain) = domain("late");
+    let link = SimulatorLink::open(link_settings.clone(), &arm()).unwrap();
+    let settings = ServeSettings { episodes: 1, steps: 3, realtime: true, ..LOCKSTEP };
+    std::thread::scope(|scope| {
+        scope.spawn(|| {
+            // Ten of its periods: a real controller passes over what was due two periods ago.
+            std::thread::sleep(Duration::from_millis(200));
+            let controller = ControllerLink::open(link_settings, anything).unwrap();
+            while let Ok(Wait::Message(seen)) = controller.wait_observation(SOON) {
+                let (answers, action) = (seen.sequence, [0.5, -0.5].into());
+                if monotonic_ns().saturating_sub(seen.scheduled_ns) < 40_000_000 {
+                    controller.send(&Action { answers, published_ns: 0, source: 0, action }).unwrap();
+                }
+            }
+        });
+        let served = serve(&mut Joints::default(), link, &settings, &AtomicBool::new(false)).unwrap();
+        assert_eq!((served.episodes, served.observations), (1, 4), "{served:?}");
+    });
+}
+
+#[test]
+fn a_robot_that_is_slower_than_its_period_leaves_its_controller_a_moment() {
+    let mut robot = Joints { takes: Some(Duration::from_millis(23)), ..Joints::default() };
+    let settings = ServeSettings { episodes: 1, steps: 10, realtime: true, ..LOCKSTEP };
+    let served = with_controller(&mut robot, "slow", settings, |_, _| Some(vec![0.5, -0.5])).unwrap();
+    assert!(served.missed_answers <= 2, "of 20 ms a period: {served:?}");
+}
+
+#[test]
+fn what_ends_it_and_a_rest_that_fails_are_both_said() {
+    let mut robot = Joints { fails_from: Some(2), ..Joints::default() };
+    let failed = with_controller(&mut robot, "both", LOCKSTEP, |_, _| Some(vec![0.5, -0.5]));
+    let said = failed.unwrap_err().to_string();
+    assert_eq!(said.matches("the brakes are on").count(), 2, "{said}");
+    assert!(said.contains("could not be brought to rest"), "{said}");
 }
 
 #[test]
