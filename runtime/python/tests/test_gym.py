@@ -42,7 +42,7 @@ class Memory:
         if found is None:
             self.clock.ns += int(timeout_s * 1e9)
             return None
-        if isinstance(found, Exception):
+        if isinstance(found, BaseException):
             raise found
         self.clock.ns += STEP_NS
         return found if isinstance(found, Answer) else Answer(sequence, np.array(found, np.float32))
@@ -229,6 +229,56 @@ def test_in_real_time_ticks_that_are_past_are_left_out_and_counted(small):
     assert counts.overruns > 0
     due = [seen[0].scheduled_ns for seen in link.seen[1:]]
     assert all(step % 50_000_000 == 0 and step > 0 for step in np.diff(due))
+
+
+def test_at_the_end_of_every_episode_a_robot_with_a_rest_is_brought_to_rest(small):
+    rests = []
+    run(small, lambda n: [0.1, 0.0], episodes=2, rest=lambda action: rests.append(action.tolist()))
+    assert len(rests) == 2, "once after each last observation, and not once more"
+    rests.clear()
+    with pytest.raises(KeyboardInterrupt):
+        run(small, lambda n: [0.1, 0.0] if n < 2 else KeyboardInterrupt(), rest=lambda action: rests.append(1))
+    assert rests == [1]
+
+
+def test_in_real_time_what_waits_for_its_first_answer_is_said_anew(small):
+    clock = Time()
+    # A controller that comes after a second, and passes over what was due more than two periods ago.
+    late = Memory(lambda n: None, clock)
+    period_ns = round(1e9 / small.rate_hz)
+
+    def wait_action(timeout_s):
+        header = late.seen[-1][0]
+        fresh = clock.ns - header.scheduled_ns < 2 * period_ns
+        if clock.ns < 1_000_000_000 or not fresh:
+            clock.ns += int(timeout_s * 1e9)
+            return None
+        clock.ns += STEP_NS
+        return Answer(header.sequence, np.zeros(2, np.float32))
+
+    late.wait_action = wait_action
+    counts = serve(Arm(), small, late, realtime=True, clock=clock)
+    assert (counts.episodes, counts.observations, counts.answers) == (1, 5, 5)
+
+
+def test_in_real_time_a_robot_slower_than_its_period_leaves_its_controller_a_moment(small):
+    clock = Time()
+    env = Arm(step_ns=round(1.02e9 / small.rate_hz), clock=clock)
+    _, _, counts = run(small, lambda n: [0, 0], env=env, clock=clock, realtime=True, episodes=3)
+    assert counts.missed_answers == 0
+
+
+def test_in_real_time_an_answer_that_is_found_long_after_its_time_is_not_executed(small):
+    clock = Time()
+
+    def stopped(n):
+        if n == 2:
+            # The whole program stood still.
+            clock.ns += 30_000_000_000
+        return [0.1, 0.0]
+
+    _, _, counts = run(small, stopped, clock=clock, realtime=True)
+    assert (counts.missed_answers, counts.rests) == (1, 1)
 
 
 def test_an_environment_of_another_robot_is_refused_before_anything_is_sent(small):

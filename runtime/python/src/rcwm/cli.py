@@ -28,8 +28,9 @@ class Parser(argparse.ArgumentParser):
 
 def run(main: Callable[[], None]) -> None:
     """Runs a program: what a user can put right is one line and status 1; Ctrl-C and a closed pipe end it cleanly."""
-    # A stop by a service manager ends a program as Ctrl-C does: the peer is told.
-    signal.signal(signal.SIGTERM, signal.default_int_handler)
+    # A stop by a service manager, or a connection that ends, ends a program as Ctrl-C does: the peer is told.
+    for number in (signal.SIGTERM, signal.SIGHUP):
+        signal.signal(number, signal.default_int_handler)
     try:
         main()
         sys.stdout.flush()

@@ -22,7 +22,10 @@ class Refused(Enum):
 
 
 class Safety:
-    """Holds what was executed last. All actions are [action numbers] f32 in the interface's units."""
+    """Holds what was executed last. All actions are [action numbers] f32 in the interface's units.
+
+    What is chosen by `accept` and `rest` counts only once it was `executed`.
+    """
 
     def __init__(self, robot: Interface):
         self.robot = robot
@@ -57,27 +60,48 @@ class Safety:
         room = ROUNDING * (self.high - self.low)
         if (values < self.low - room).any() or (values > self.high + room).any():
             return Refused.OUT_OF_LIMITS
-        values = np.clip(values, self.low, self.high)
-        known = np.isfinite(self.last)
-        nearest = np.clip(values, self.last - self.most, self.last + self.most)
-        self.last, self.commanded = np.where(known, nearest, values).astype(np.float32), True
-        return self.last
+        # Limits come last: a robot may have been moved beyond them.
+        return np.clip(self._near(values), self.low, self.high).astype(np.float32)
 
     def rest(self, state: np.ndarray) -> np.ndarray | None:
-        """The interface's safe action for a measured state; None where it is to hold a command and there was none."""
+        """The interface's safe action for a measured state; None where it is to hold a command and there was none.
+
+        A place to drive to is driven to no faster than `rate_max`; what holds a change or a velocity stands still.
+        """
         rest = np.zeros(self.robot.action_numbers, np.float32)
+        near = np.zeros(self.robot.action_numbers, bool)
         for part, place in self._parts():
             if isinstance(part.fallback, tuple):
-                rest[place] = part.fallback
-            elif part.fallback == "hold-measured" or (part.fallback == "hold" and not self.commanded):
+                rest[place], near[place] = part.fallback, True
+            elif part.fallback == "zero" or part.mode != "absolute":
+                near[place] = True
+            elif part.fallback == "hold-measured" or not self.commanded:
                 measured = self._measured(part.measured, state)
-                if measured is None:
+                # What was executed last is the next best.
+                known = measured is not None and np.isfinite(measured).all()
+                if not known and not self.commanded:
                     return None
-                rest[place] = measured
-            elif part.fallback == "hold":
+                rest[place] = measured if known else self.last[place]
+            else:
                 rest[place] = self.last[place]
-        self.last, self.commanded = np.clip(rest, self.low, self.high), True
-        return self.last
+        return np.clip(np.where(near, self._near(rest), rest), self.low, self.high).astype(np.float32)
+
+    def executed(self, action: np.ndarray) -> None:
+        """What was executed, for what comes next."""
+        self.last, self.commanded = np.array(action, np.float32), True
+
+    def still_moves(self, action: np.ndarray) -> bool:
+        """Whether a robot that has executed this still moves by it: a change or a velocity on its way to rest."""
+        for part, place in self._parts():
+            safe = part.fallback if isinstance(part.fallback, tuple) else 0.0
+            if part.mode != "absolute" and (action[place] != np.clip(safe, self.low[place], self.high[place])).any():
+                return True
+        return False
+
+    def _near(self, wanted: np.ndarray) -> np.ndarray:
+        """No farther from what was executed last than may be."""
+        nearest = np.clip(wanted, self.last - self.most, self.last + self.most)
+        return np.where(np.isfinite(self.last), nearest, wanted).astype(np.float32)
 
     def _parts(self) -> Iterator[tuple[Action, slice]]:
         at = 0

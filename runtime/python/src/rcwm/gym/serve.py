@@ -2,8 +2,12 @@
 
 from __future__ import annotations
 
+import signal
+import threading
 from collections import deque
-from dataclasses import asdict, dataclass
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from dataclasses import asdict, dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -16,6 +20,12 @@ from .safety import Refused, Safety
 
 # Share of a period that is left to the controller, however long the environment takes for a step.
 ANSWER_SHARE_MIN = 0.1
+# Of a period: by how much an answer may be late.
+LATE_MAX = 0.1
+# Actions by which a robot comes to rest that may change its command only slowly, at most.
+REST_ACTIONS_MAX = 200
+# Longest wait before what is seen is said anew, while time stands still in real time.
+SLICE_S = 0.1
 # Steps whose longest duration is expected of the next.
 STEPS_WATCHED = 20
 
@@ -58,6 +68,7 @@ def serve(
     realtime: bool = False,
     observe: Observe | None = None,
     timeout_s: float = 60.0,
+    rest: Callable[[np.ndarray], None] | None = None,
     clock: Clock | None = None,
 ) -> Counts:
     """Serves whole episodes of a Gymnasium environment as the robot of an instance (or of a link that is open already).
@@ -67,6 +78,10 @@ def serve(
     has left, executes the safe action and goes on. An answer that is not finite, out of limits or of another
     length is never executed: the safe action is, and it is counted. `observe` is described in `rcwm.gym`.
 
+    A robot that may still move by its last command is given its safe action at the end of each episode, and whatever
+    else ends the loop: by `rest`, which a real robot should have; without it by `env.step`, but not where the
+    episode is over, since environments are not stepped then.
+
     Success is `info["success"]` or `info["is_success"]`; it counts where it ever was in an episode.
     Raises `NoAnswer` after `timeout_s` without any answer, and `RcwmError` for an environment that is not this robot.
     """
@@ -74,17 +89,33 @@ def serve(
     link = _open(interface, instance) if isinstance(instance, str) else instance
     loop = None
     try:
-        loop = _Loop(env, interface, link, observe, realtime, timeout_s, clock or Clock())
+        loop = _Loop(env, interface, link, observe, realtime, timeout_s, rest, clock or Clock())
         for episode in range(episodes):
             loop.episode(seed if episode == 0 else None)
         return loop.counts
     finally:
-        # The peer first, then the robot: whatever ends the loop, neither is left with the last command.
-        try:
-            link.close()
-        finally:
-            if loop is not None:
-                loop.come_to_rest()
+        # The peer first, then the robot: whatever ends the loop, neither is left with the last command. Another
+        # Ctrl-C does not break that off.
+        with _uninterrupted():
+            try:
+                link.close()
+            finally:
+                if loop is not None:
+                    loop.come_to_rest()
+
+
+@contextmanager
+def _uninterrupted() -> Iterator[None]:
+    if threading.current_thread() is not threading.main_thread():
+        yield
+        return
+    numbers = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
+    before = [(number, signal.signal(number, signal.SIG_IGN)) for number in numbers]
+    try:
+        yield
+    finally:
+        for number, handler in before:
+            signal.signal(number, handler)
 
 
 def _open(interface: Interface, instance: str) -> Link:
@@ -102,6 +133,7 @@ class _Loop:
         observe: Observe | None,
         realtime: bool,
         timeout_s: float,
+        rest: Callable[[np.ndarray], None] | None,
         clock: Clock,
     ):
         self.env, self.robot, self.link, self.observe = env, robot, link, observe
@@ -109,8 +141,11 @@ class _Loop:
         self.period_ns = round(1e9 / robot.rate_hz)
         self.safety, self.counts = Safety(robot), Counts()
         self.sequence = 0
-        #: What is measured in the middle of an episode.
-        self.measured: np.ndarray | None = None
+        self.rest = rest
+        #: What was measured last, where the robot may still move by its last command.
+        self.moving: np.ndarray | None = None
+        #: Whether the environment can be stepped.
+        self.runs = False
         self.durations_ns: deque[int] = deque([0], STEPS_WATCHED)
 
     def episode(self, seed: int | None) -> None:
@@ -124,13 +159,24 @@ class _Loop:
             captured_ns = self.clock.now_ns()
             if scheduled_ns is not None:
                 scheduled_ns = self._next_tick(scheduled_ns)
-            self._publish(seen, executed, Header(
+            header = Header(
                 self.sequence, self.counts.episodes, step, flags, reward, captured_ns,
                 scheduled_ns or captured_ns, self.period_ns if self.realtime else 0,
-            ))  # fmt: skip
+            )  # fmt: skip
+            self._publish(seen, executed, header)
+            self.counts.observations += 1
             over = Flags.LAST in flags
-            self.measured = None if over else seen.state
-            answer = self._first_answer() if scheduled_ns is None else self._answer_by(scheduled_ns)
+            self.runs = not over
+            if self.moving is not None:
+                self.moving = seen.state
+            if over:
+                # Nothing more is answered: whatever moves by its last command would go on.
+                self.come_to_rest()
+            answer: Answer | None
+            if scheduled_ns is None:
+                answer = self._first_answer((seen, executed, header) if self.realtime else None)
+            else:
+                answer = self._answer_by(scheduled_ns)
             if self.realtime and scheduled_ns is None:
                 scheduled_ns = self.clock.now_ns()
             self.sequence += 1
@@ -138,7 +184,9 @@ class _Loop:
                 break
             executed, held = self._choose(answer, seen.state)
             begun_ns = self.clock.now_ns()
+            self.moving = seen.state
             observation, reward, terminated, truncated, info = self.env.step(executed.copy())
+            self.safety.executed(executed)
             self.durations_ns.append(self.clock.now_ns() - begun_ns)
             seen, reward, step = see(self.env, self.robot, observation, self.observe), float(reward), step + 1
             if not np.isfinite(reward):
@@ -152,39 +200,64 @@ class _Loop:
         self.counts.successes += succeeded
 
     def come_to_rest(self) -> None:
-        """One safe action where an episode was broken off."""
-        measured, self.measured = self.measured, None
-        rest = None if measured is None else self.safety.rest(measured)
-        if rest is not None:
-            self.env.step(rest.copy())
+        """The safe action, where the robot may still move by another; once more while it may change only slowly."""
+        measured, self.moving = self.moving, None
+        if measured is None or (self.rest is None and not self.runs):
+            return
+        for _ in range(REST_ACTIONS_MAX):
+            rest = self.safety.rest(measured)
+            if rest is None:
+                return
+            if self.rest is not None:
+                self.rest(rest.copy())
+            else:
+                self.env.step(rest.copy())
+            self.safety.executed(rest)
+            if not self.safety.still_moves(rest):
+                return
+            if self.realtime:
+                self.clock.sleep_until(self.clock.now_ns() + self.period_ns)
 
     def _publish(self, seen: Seen, executed: np.ndarray, header: Header) -> None:
         with_mask = [camera.name for camera in self.robot.cameras if camera.mask]
         if with_mask and all(name in seen.masks for name in with_mask):
             header = header.with_flag(Flags.MASK_VALID)
         self.link.publish(header, seen.state, executed, seen.images, seen.masks)
-        self.counts.observations += 1
 
-    def _first_answer(self) -> Answer:
-        """Time stands still until somebody answers. Raises `NoAnswer`."""
+    def _first_answer(self, stands: tuple[Seen, np.ndarray, Header] | None) -> Answer:
+        """Time stands still until somebody answers. Raises `NoAnswer`.
+
+        A controller passes over what was due long ago: in real time, what stands is published anew, due now.
+        """
         deadline_ns = self.clock.now_ns() + self.timeout_ns
+        slice_ns = min(int(SLICE_S * 1e9), self.period_ns)
         while True:
-            answer = self._wait(deadline_ns)
+            now_ns = self.clock.now_ns()
+            answer = self._wait(deadline_ns if stands is None else min(deadline_ns, now_ns + slice_ns))
             if answer is not None:
                 return answer
             if self.clock.now_ns() >= deadline_ns:
-                waited = self.timeout_ns / 1e9
-                raise NoAnswer(f"no answer within {waited:g} s: is a controller running on this instance?")
+                waited, stale = self.timeout_ns / 1e9, self.counts.stale_answers
+                raise NoAnswer(
+                    f"no answer within {waited:g} s ({stale} to something else): "
+                    "is a controller running on this instance?"
+                )
+            if stands is not None:
+                seen, executed, header = stands
+                self._publish(seen, executed, replace(header, scheduled_ns=self.clock.now_ns()))
 
     def _answer_by(self, scheduled_ns: int) -> Answer | None:
         """What comes early enough to be executed before the next observation is due."""
-        room_ns = max(self.period_ns - max(self.durations_ns), int(ANSWER_SHARE_MIN * self.period_ns))
-        deadline_ns = scheduled_ns + room_ns
+        room_ns = int(ANSWER_SHARE_MIN * self.period_ns)
+        # However late the observation was, a controller gets a moment.
+        deadline_ns = max(scheduled_ns + self.period_ns - max(self.durations_ns), self.clock.now_ns() + room_ns)
         while True:
             answer = self._wait(deadline_ns)
-            if answer is not None:
+            now_ns = self.clock.now_ns()
+            if answer is not None and now_ns <= deadline_ns + int(LATE_MAX * self.period_ns):
                 return answer
-            if self.clock.now_ns() >= deadline_ns:
+            # It came, but this program was stopped meanwhile: it says what was right then.
+            if answer is not None or now_ns >= deadline_ns:
                 self.counts.missed_answers += 1
                 return None
 
