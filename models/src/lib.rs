@@ -14,6 +14,7 @@
 //! | [`files`] | atomic writes, checksums, capped reads |
 //! | [`help`] | the examples of a help text |
 //! | [`lock`] | one writer a folder |
+//! | [`machine`] | what a measurement was made on |
 //! | `picture` | PNG files (feature `pictures`) |
 //! | [`programs`] | where the programs that start one another are |
 //! | [`progress`] | how far a long work is, on a terminal or by lines |
@@ -28,6 +29,7 @@ pub mod files;
 pub mod help;
 pub mod interface;
 pub mod lock;
+pub mod machine;
 pub mod onnx;
 #[cfg(feature = "pictures")]
 pub mod picture;

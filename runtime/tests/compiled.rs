@@ -77,6 +77,35 @@ fn every_optimization_gives_what_the_exported_parts_give() {
 }
 
 #[test]
+fn two_graphs_in_the_other_engine_give_what_its_exported_parts_give() {
+    let bundle = Bundle::open(&smallest_bundle()).unwrap();
+    let [mut exported, mut split] =
+        [Form::Exported, Form::Split].map(|form| policy(&bundle, EngineSettings::ort(1).with_form(form)));
+    let mut executed = None;
+    for step in 0..20 {
+        // What is worked ahead must be what is used: every other tick does it at once.
+        if step % 2 == 0 {
+            split.work_ahead(executed.as_ref()).unwrap();
+        }
+        let expected = exported.observe(&image(step), executed.as_ref()).unwrap();
+        let found = split.observe(&image(step), executed.as_ref()).unwrap();
+        for (found, expected) in found.mean.iter().zip(expected.mean.iter()) {
+            assert!((found - expected).abs() < 1e-5, "step {step}: {found} {expected}");
+        }
+        let classes =
+            |policy: &Policy| policy.state().branches.iter().map(|b| b.z.clone()).collect::<Vec<_>>();
+        assert_eq!(classes(&split), classes(&exported), "step {step}");
+        executed = Some(expected.action);
+        if step % 5 == 4 {
+            let missing = expected.action;
+            let (found, expected) = (split.imagine(&missing).unwrap(), exported.imagine(&missing).unwrap());
+            assert!((found.mean[0] - expected.mean[0]).abs() < 1e-5, "step {step}, imagined");
+            executed = Some(expected.action);
+        }
+    }
+}
+
+#[test]
 fn one_thread_and_two_give_the_same_bits() {
     let bundle = Bundle::open(&smallest_bundle()).unwrap();
     let settings = with(Optimizations::EXACT);

@@ -80,3 +80,19 @@ pub fn compile(bundle: &Bundle, optimizations: Optimizations) -> Result<Vec<Segm
     fuse::fuse(&mut graph, optimizations);
     Ok(segments::cut(&graph, bundle.manifest.kind.parts()))
 }
+
+/// The tick as it was exported, as two files: what can be known before the image is there, and the rest. What any engine can work ahead, too.
+///
+/// # Errors
+/// [`CompileError::Part`].
+pub fn halve(bundle: &Bundle) -> Result<[Segment; 2], CompileError> {
+    let graph = join::join(bundle)?;
+    let reason =
+        |reason: &str| CompileError::Part { part: bundle.manifest.kind.parts()[0], reason: reason.into() };
+    let mut opsets = graph.opsets.values();
+    let first = opsets.next();
+    if opsets.any(|opset| Some(opset) != first) {
+        return Err(reason("the parts are of several operator sets, and cannot be one graph"));
+    }
+    segments::halve(&graph).ok_or_else(|| reason("the tick does not come apart where the image comes in"))
+}

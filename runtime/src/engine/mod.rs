@@ -9,9 +9,10 @@ mod tract;
 pub(crate) mod weights;
 
 use rcwm_models::bundle::{Bundle, DType, PartName, TensorSpec};
+use rcwm_models::onnx::data_type;
 use serde::{Deserialize, Serialize};
 
-use crate::compile::Optimizations;
+use crate::compile::{Fact, Optimizations};
 
 /// Which engine.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Hash, Serialize, Deserialize, clap::ValueEnum)]
@@ -48,6 +49,8 @@ pub enum Form {
     Exported,
     /// Their segments, ahead of the image where they can be, with our operators in place of hot nodes; tract only.
     Compiled(Optimizations),
+    /// Two graphs, cut where the image comes in: the first is worked ahead; ONNX Runtime only.
+    Split,
 }
 
 /// Which engine, and how much of the machine it may use.
@@ -124,7 +127,7 @@ impl EngineSettings {
             Form::Compiled(optimizations) => {
                 self.with_form(Form::Compiled(Optimizations { half_weights, ..optimizations }))
             }
-            Form::Exported => self,
+            Form::Exported | Form::Split => self,
         }
     }
 
@@ -297,7 +300,29 @@ pub fn load(bundle: &Bundle, part: PartName, settings: EngineSettings) -> Result
     weights::check(part, bytes, weights::WEIGHT_MAX)?;
     let entry = bundle.manifest.part(part).ok_or(EngineError::NoPart { part })?;
     let (inputs, outputs) = (entry.inputs.clone(), entry.outputs.clone());
-    let source = Source { part, bytes, inputs, outputs };
+    load_source(Source { part, bytes, inputs, outputs }, settings)
+}
+
+/// Loads a graph that was put together from checked parts; `tensors` are what goes in and what comes out.
+pub(crate) fn load_graph(
+    part: PartName,
+    bytes: &[u8],
+    tensors: [&[(String, Fact)]; 2],
+    settings: EngineSettings,
+) -> Result<Box<dyn Part>, EngineError> {
+    let spec = |(name, fact): &(String, Fact)| {
+        let dtype = match fact.dtype {
+            data_type::UINT8 => DType::U8,
+            data_type::INT64 => DType::I64,
+            _ => DType::F32,
+        };
+        TensorSpec::new(name, dtype, &fact.shape)
+    };
+    let [inputs, outputs] = tensors.map(|tensors| tensors.iter().map(spec).collect());
+    load_source(Source { part, bytes, inputs, outputs }, settings)
+}
+
+fn load_source(source: Source<'_>, settings: EngineSettings) -> Result<Box<dyn Part>, EngineError> {
     match settings.kind {
         EngineKind::Tract => Ok(Box::new(tract::TractPart::load(source)?)),
         EngineKind::Ort => load_ort(source, settings.threads),

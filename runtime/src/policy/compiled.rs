@@ -6,21 +6,22 @@
 mod branches;
 mod pieces;
 mod places;
+mod split;
 
 use std::sync::Arc;
 use std::time::Duration;
 
 use rcwm_models::bundle::{Bundle, PartName};
 use rcwm_models::wire::ActionValues;
-use tract_onnx::prelude::TractResult;
 
-use super::buffers::finite;
 use super::stages::StageClock;
 use super::tick::{Tick, Work};
-use super::{Buffers, Inputs, PolicyError};
+use super::{Inputs, PolicyError};
 use crate::compile::{CompileError, Optimizations, compile};
 use crate::engine::{EngineError, weights};
 use crate::operators::SharedTeam;
+pub(super) use split::Split;
+
 use branches::Branches;
 use pieces::{Piece, Values};
 use places::Places;
@@ -67,7 +68,7 @@ impl Compiled {
             let piece = Piece::load(&segment, &mut values, team.as_ref().filter(|_| shares))?;
             if segment.late { late.push(piece) } else { early.push(piece) }
         }
-        let places = Places::of(kind, &values, &early)?;
+        let places = Places::of(kind, &values, |place| early.iter().any(|piece| piece.makes(place)))?;
         let mut late = |part: PartName| {
             let found =
                 late.iter().position(|piece: &Piece| piece.part == part).map(|index| late.remove(index));
@@ -84,60 +85,11 @@ impl Compiled {
     fn act(&mut self, work: &mut Work<'_>) -> Result<(), PolicyError> {
         let Self { actor, values, places, team, .. } = self;
         let Work { buffers, clock, .. } = work;
-        let mut run = || {
-            actor.run(values)?;
-            values.copy(places.mean, &mut buffers.mean)?;
-            values.copy(places.std, &mut buffers.std)
-        };
-        run().map_err(|error| run_error(PartName::Actor, &error))?;
+        actor.run(values).map_err(|error| run_error(PartName::Actor, &error))?;
+        places.copy_decision(values, buffers)?;
         clock.ended(PartName::Actor);
         // In the encoder, or just now.
         clock.helper_late |= team.as_ref().is_some_and(|team| team.take_late());
-        finite(PartName::Actor, "mean", &buffers.mean)?;
-        finite(PartName::Actor, "std", &buffers.std)
-    }
-
-    /// The tick's inputs but the image.
-    fn fill(&mut self, action: &ActionValues, work: &Work<'_>) -> TractResult<()> {
-        let (Self { values, places, .. }, Work { state, noise, .. }) = (self, work);
-        values.fill(places.action, action)?;
-        for ((at, state), noise) in places.branches.iter().zip(&state.branches).zip(noise.branches()) {
-            values.fill(at.z, &state.z)?;
-            values.fill(at.h, &state.h)?;
-            values.fill(at.noise, noise)?;
-        }
-        Ok(())
-    }
-
-    /// What the early pieces have made.
-    fn copy_priors(&self, buffers: &mut Buffers) -> Result<(), PolicyError> {
-        let Self { values, places, .. } = self;
-        for ((part, branch), at) in buffers.named().zip(&places.branches) {
-            let mut copy = || {
-                values.copy(at.h_next, &mut branch.h_next)?;
-                values.copy(at.prior_z, &mut branch.prior_z)?;
-                values.copy(at.prior_log_probs, &mut branch.prior_log_probs)
-            };
-            copy().map_err(|error| run_error(part, &error))?;
-        }
-        let Some([e, attention]) = places.interaction else { return Ok(()) };
-        let mut copy = || {
-            values.copy(e, &mut buffers.e)?;
-            values.copy(attention, &mut buffers.attention)
-        };
-        copy().map_err(|error| run_error(PartName::Interaction, &error))
-    }
-
-    /// What the branches have made of the image.
-    fn copy_posteriors(&self, buffers: &mut Buffers) -> Result<(), PolicyError> {
-        let Self { values, places, .. } = self;
-        for ((part, branch), at) in buffers.named().zip(&places.branches) {
-            let mut copy = || {
-                values.copy(at.posterior_z, &mut branch.posterior_z)?;
-                values.copy(at.posterior_log_probs, &mut branch.posterior_log_probs)
-            };
-            copy().map_err(|error| run_error(part, &error))?;
-        }
         Ok(())
     }
 }
@@ -155,27 +107,21 @@ fn run_error(part: PartName, error: &tract_onnx::prelude::TractError) -> PolicyE
 impl Tick for Compiled {
     fn work_ahead(&mut self, action: &ActionValues, work: &mut Work<'_>) -> Result<(), PolicyError> {
         let first = self.early.first().map_or(PartName::Actor, |piece| piece.part);
-        self.fill(action, work).map_err(|error| run_error(first, &error))?;
+        self.places.fill(&mut self.values, action, work).map_err(|error| run_error(first, &error))?;
         for piece in &mut self.early {
             piece.run(&mut self.values).map_err(|error| run_error(piece.part, &error))?;
             work.clock.ended(piece.part);
         }
-        self.copy_priors(work.buffers)?;
-        finite(PartName::Interaction, "e", &work.buffers.e)?;
-        work.buffers.check_priors()
+        self.places.copy_priors(&self.values, work.buffers)
     }
 
     fn observe(&mut self, inputs: Inputs<'_>, work: &mut Work<'_>) -> Result<(), PolicyError> {
         let Self { values, places, encoder, .. } = self;
-        let encoded = values
-            .fill(places.image, inputs.image)
-            .and_then(|()| values.fill(places.state, inputs.state))
-            .and_then(|()| encoder.run(values));
+        let encoded = places.fill_inputs(values, inputs).and_then(|()| encoder.run(values));
         encoded.map_err(|error| run_error(PartName::Encoder, &error))?;
         work.clock.ended(PartName::Encoder);
         self.branches.run(&mut self.values, work.clock).map_err(|(part, error)| run_error(part, &error))?;
-        self.copy_posteriors(work.buffers)?;
-        work.buffers.check_posteriors()?;
+        self.places.copy_posteriors(&self.values, work.buffers)?;
         self.act(work)
     }
 

@@ -359,5 +359,6 @@ fn load_tick(bundle: &Bundle, settings: EngineSettings) -> Result<Box<dyn Tick>,
         Form::Compiled(optimizations) => {
             Box::new(compiled::Compiled::load(bundle, optimizations, settings.threads)?)
         }
+        Form::Split => Box::new(compiled::Split::load(bundle, settings)?),
     })
 }

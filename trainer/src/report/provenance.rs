@@ -1,5 +1,6 @@
 use std::path::{Component, Path, PathBuf};
 
+use rcwm_models::machine::Machine;
 use serde::{Deserialize, Serialize};
 
 /// How many of a long path's last names are shown.
@@ -26,22 +27,16 @@ impl Provenance {
     /// Now and here; `device` as in `--device`.
     #[must_use]
     pub fn now(device: &str) -> Self {
+        let Machine { processor, cores, .. } = Machine::here();
         Self {
             date: jiff::Timestamp::now().strftime("%Y-%m-%d %H:%M UTC").to_string(),
             version: env!("CARGO_PKG_VERSION").to_owned(),
             revision: env!("RCWM_SOURCE_REVISION").to_owned(),
-            processor: processor(),
-            cores: std::thread::available_parallelism().map_or(1, usize::from),
+            processor,
+            cores,
             device: device.to_owned(),
         }
     }
-}
-
-/// The processor's name, as Linux knows it.
-fn processor() -> String {
-    let text = std::fs::read_to_string("/proc/cpuinfo").unwrap_or_default();
-    let name = text.lines().find_map(|line| line.strip_prefix("model name")?.split_once(':'));
-    name.map_or("unknown", |(_, name)| name.trim()).to_owned()
 }
 
 /// A path as others may read it: relative to the present folder where it lies there, else its last names. Other words stay.

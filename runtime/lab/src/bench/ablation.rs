@@ -19,12 +19,17 @@ pub struct Case {
 
 /// ONNX Runtime as the baseline: the five exported parts one after another, one thread.
 pub(super) const BASELINE: EngineSettings = EngineSettings::ort(1);
+/// ONNX Runtime with our schedule: what needs only the action worked ahead, one graph from image to action, warmed alike.
+pub(super) const fn split(threads: usize) -> EngineSettings {
+    EngineSettings::ort(threads).with_form(Form::Split)
+}
 /// The compiled tick on one thread.
 pub(super) const SINGLE: EngineSettings = EngineSettings::single_threaded(EngineKind::Tract);
 
-/// The engines as they are deployed: tract on one and on two threads, ONNX Runtime on one and on two.
+/// tract as it is deployed on one and on two threads; ONNX Runtime on one and on two, the exported parts one after another and, where there is
+/// a world model, with our schedule.
 #[must_use]
-pub fn engines(kinds: &[EngineKind]) -> Vec<Case> {
+pub fn engines(kinds: &[EngineKind], has_world_model: bool) -> Vec<Case> {
     let case = |name, settings| Case { name, settings, warms_caches: true };
     let mut cases = Vec::new();
     for kind in kinds {
@@ -38,6 +43,10 @@ pub fn engines(kinds: &[EngineKind]) -> Vec<Case> {
             EngineKind::Ort => {
                 cases.push(case("ort", BASELINE));
                 cases.push(case("ort, 2 threads", EngineSettings::ort(2)));
+                if has_world_model {
+                    cases.push(case("ort, split", split(1)));
+                    cases.push(case("ort, split, 2 threads", split(2)));
+                }
             }
         }
     }

@@ -8,11 +8,13 @@ mod ablation;
 mod control;
 mod limit;
 mod report;
+mod system;
 
 pub use ablation::{Case, ablation, engines};
 pub use control::ControlBench;
 pub use limit::{Limit, Machine, Stalls, measure_machine, measure_stalls};
 pub use report::{BenchReport, CaseBench, Step};
+pub use system::{Measured as MeasuredBundle, System};
 
 use std::time::{Duration, Instant};
 
@@ -52,6 +54,9 @@ pub enum BenchError {
     /// The parts could not be taken apart.
     #[error(transparent)]
     Compile(#[from] CompileError),
+    /// The manifest can no longer be read.
+    #[error(transparent)]
+    File(#[from] rcwm_models::files::FileError),
     /// It was ended before the warm-up was over.
     #[error("stopped before a tick was measured: give it more time, or fewer --ticks")]
     Stopped,
@@ -79,6 +84,7 @@ pub fn bench(
     real_time: Option<realtime::Request>,
     go_on: &mut dyn FnMut() -> bool,
 ) -> Result<Measured, BenchError> {
+    let of = MeasuredBundle::of(bundle)?;
     let machine = measure_machine(inspect(bundle)?.tick.weight_bytes)?;
     let limit = machine.of(&late_cost(bundle)?);
     let mut runners = cases.iter().map(|case| Runner::new(bundle, *case)).collect::<Result<Vec<_>, _>>()?;
@@ -116,11 +122,11 @@ pub fn bench(
         return Err(BenchError::Stopped);
     }
     let controls = controls.iter().map(Control::report).collect();
-    let conditions = Conditions { stalls, granted, controls };
+    let conditions = Conditions { limit, stalls, granted, controls };
     let late: Vec<u64> = runners.iter().map(|runner| runner.helper_late).collect();
     let runs: Vec<(Case, Telemetry)> =
         runners.into_iter().map(|runner| (runner.case, runner.telemetry)).collect();
-    Ok(Measured { report: BenchReport::new(bundle, measured, limit, conditions, &runs, &late), runs })
+    Ok(Measured { report: BenchReport::new(of, measured, conditions, &runs, &late), runs })
 }
 
 /// One for tract on one thread and one for tract as deployed, where they run; they take as long as those took in the warm-up.
@@ -141,6 +147,7 @@ fn make_controls(runners: &[Runner]) -> Result<Vec<Control>, BenchError> {
 
 /// Under which conditions was measured.
 pub(crate) struct Conditions {
+    limit: Limit,
     stalls: Stalls,
     granted: Option<realtime::Granted>,
     controls: Vec<ControlBench>,
@@ -168,8 +175,10 @@ impl Measured {
                 Curve::of(case.name, telemetry.histogram(Stage::Tick))
             };
             let curves: Vec<_> = self.runs.iter().map(of).collect();
-            let title =
-                format!("image to action, {} bundle, {} ticks each", self.report.preset, self.report.ticks);
+            let title = format!(
+                "image to action, {} bundle, {} ticks each",
+                self.report.bundle.preset, self.report.ticks
+            );
             plot(file, &title, &curves, None)?;
         }
         Ok(())

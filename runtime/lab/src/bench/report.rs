@@ -1,10 +1,10 @@
 //! What was measured, for people and for machines.
 
-use rcwm_models::bundle::Bundle;
 use serde::Serialize;
 
-use super::ablation::{BASELINE, SINGLE};
-use super::{Case, Conditions, ControlBench, Limit, Stalls};
+use super::ablation::{BASELINE, SINGLE, split};
+use super::system::Measured as MeasuredBundle;
+use super::{Case, Conditions, ControlBench, Limit, Stalls, System};
 use rcwm_runtime::engine::EngineSettings;
 use rcwm_runtime::realtime::Granted;
 use rcwm_runtime::telemetry::{Latency, Stage, Telemetry, table};
@@ -36,8 +36,8 @@ pub struct Step {
 /// A bench run.
 #[derive(Debug, Clone, PartialEq, Serialize)]
 pub struct BenchReport {
-    /// Preset of the bundle.
-    pub preset: String,
+    pub system: System,
+    pub bundle: MeasuredBundle,
     /// Ticks of each case.
     pub ticks: usize,
     /// Median of tract as deployed over that of ONNX Runtime, which runs the five exported parts one after another with one thread;
@@ -45,6 +45,10 @@ pub struct BenchReport {
     pub ratio_p50_vs_ort: Option<f64>,
     /// The same of tract with one thread.
     pub ratio_p50_vs_ort_single_thread: Option<f64>,
+    /// Median of tract as deployed over that of ONNX Runtime with our schedule, with one thread or with two, whichever was faster.
+    pub ratio_p50_vs_ort_split: Option<f64>,
+    /// The same, both with one thread.
+    pub ratio_p50_vs_ort_split_single_thread: Option<f64>,
     /// The limit by arithmetic over the median of tract as deployed; absent unless tract ran.
     pub share_of_limit: Option<f64>,
     /// The same of tract with one thread.
@@ -67,13 +71,13 @@ pub struct BenchReport {
 
 impl BenchReport {
     pub(super) fn new(
-        bundle: &Bundle,
+        bundle: MeasuredBundle,
         ticks: usize,
-        limit: Limit,
         conditions: Conditions,
         runs: &[(Case, Telemetry)],
         helper_late: &[u64],
     ) -> Self {
+        let Conditions { limit, stalls, granted, controls } = conditions;
         let engines: Vec<CaseBench> = runs
             .iter()
             .zip(helper_late)
@@ -87,20 +91,26 @@ impl BenchReport {
         let find = |settings: EngineSettings| engines.iter().find(|bench| bench.case.settings == settings);
         let (deployed, single, baseline) = (find(EngineSettings::tract()), find(SINGLE), find(BASELINE));
         let tail = |bench: &CaseBench| bench.tick().map(|tick| tick.p999_us / tick.p50_us);
-        let ratio = |bench: Option<&CaseBench>| Some(bench?.tick()?.p50_us / baseline?.tick()?.p50_us);
+        let p50 = |bench: Option<&CaseBench>| Some(bench?.tick()?.p50_us);
+        let ratio = |ours, theirs| Some(p50(ours)? / p50(theirs)?);
+        let (split_1, split_2) = (find(split(1)), find(split(2)));
+        let split_is_faster_alone = p50(split_1) <= p50(split_2);
         Self {
-            preset: bundle.manifest.provenance.preset.clone(),
+            system: System::here(),
+            bundle,
             ticks,
-            ratio_p50_vs_ort: ratio(deployed),
-            ratio_p50_vs_ort_single_thread: ratio(single),
+            ratio_p50_vs_ort: ratio(deployed, baseline),
+            ratio_p50_vs_ort_single_thread: ratio(single, baseline),
+            ratio_p50_vs_ort_split: ratio(deployed, if split_is_faster_alone { split_1 } else { split_2 }),
+            ratio_p50_vs_ort_split_single_thread: ratio(single, split_1),
             share_of_limit: deployed.map(|bench| bench.share_of_limit),
             share_of_limit_single_thread: single.map(|bench| bench.share_of_limit),
             p999_over_p50: deployed.and_then(tail),
             p999_over_p50_single_thread: single.and_then(tail),
-            controls: conditions.controls,
+            controls,
             limit,
-            stalls: conditions.stalls,
-            realtime: conditions.granted,
+            stalls,
+            realtime: granted,
             engines,
         }
     }
@@ -110,11 +120,16 @@ impl BenchReport {
     pub fn text(&self) -> String {
         let Limit { gemm_gflops, read_gb_per_s, convolution_us, weights_us, tick_us, .. } = self.limit;
         let mut text = format!(
-            "bench      {} bundle, {} ticks each, interleaved\n\
-             machine    {gemm_gflops:.1} GFLOP/s in matrix products, {read_gb_per_s:.1} GB/s of weights, one core each\n\
+            "bench      {} ({}, {}, {}), {} ticks each, interleaved\n\
+             {}machine    {gemm_gflops:.1} GFLOP/s in matrix products, {read_gb_per_s:.1} GB/s of weights, one core each\n\
              limit      {tick_us:.1} us from image to action on one thread: convolutions {convolution_us:.1}, other weights \
              {weights_us:.1}\n",
-            self.preset, self.ticks
+            self.bundle.name,
+            self.bundle.kind,
+            self.bundle.preset,
+            &self.bundle.sha256[..12],
+            self.ticks,
+            self.system.lines()
         );
         let Stalls { per_s, share, p50_us, max_us } = self.stalls;
         text += &format!(
@@ -140,6 +155,8 @@ impl BenchReport {
         for (name, value) in [
             ("ratio_p50_vs_ort", self.ratio_p50_vs_ort),
             ("ratio_p50_vs_ort_single_thread", self.ratio_p50_vs_ort_single_thread),
+            ("ratio_p50_vs_ort_split", self.ratio_p50_vs_ort_split),
+            ("ratio_p50_vs_ort_split_single_thread", self.ratio_p50_vs_ort_split_single_thread),
             ("share_of_limit", self.share_of_limit),
             ("share_of_limit_single_thread", self.share_of_limit_single_thread),
             ("p999_over_p50", self.p999_over_p50),
@@ -167,7 +184,7 @@ impl BenchReport {
     pub fn steps_text(&self) -> String {
         let mut text = format!(
             "| {} bundle, {} ticks | image to action, p50 us | share of the limit ({:.0} us on one thread) |\n| --- | --- | --- |\n",
-            self.preset, self.ticks, self.limit.tick_us
+            self.bundle.preset, self.ticks, self.limit.tick_us
         );
         for Step { name, p50_us, share_of_limit } in self.steps() {
             text += &format!("| {name} | {p50_us:.1} | {:.0} % |\n", 100.0 * share_of_limit);

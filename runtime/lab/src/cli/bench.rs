@@ -18,7 +18,8 @@ pub(super) struct BenchArguments {
     /// The bundle's folder
     #[arg(long, value_name = "DIR")]
     bundle: PathBuf,
-    /// Engine; tract runs as deployed and on one thread, ONNX Runtime the exported parts with one and with two threads
+    /// Engine; tract runs as deployed and on one thread; ONNX Runtime, with one and with two threads, the exported parts in a row and, worked
+    /// ahead as ours is, two graphs cut where the image comes in
     #[arg(long, value_enum, default_value = "all")]
     engine: EngineChoice,
     /// Measured ticks of each engine
@@ -43,7 +44,7 @@ pub(super) fn run(arguments: &BenchArguments) -> anyhow::Result<()> {
     arguments.files.prepare()?;
     let bundle = shared::open_bundle(&arguments.bundle)?;
     let (kinds, left_out) = arguments.engine.engines()?;
-    let mut cases = crate::bench::engines(&kinds);
+    let mut cases = crate::bench::engines(&kinds, bundle.manifest.model.is_some());
     if arguments.ablation {
         if bundle.manifest.kind == BundleKind::Recurrent {
             anyhow::bail!(

@@ -229,7 +229,7 @@ mod tests {
             part,
             late: true,
             inputs: vec![("image".into(), fact)],
-            outputs: vec![output.into()],
+            outputs: vec![(output.into(), None)],
             onnx: model.encode_to_vec(),
             operators: vec!["Neg".into()],
         };

@@ -9,6 +9,7 @@ use tract_onnx::tract_core::plan::eval;
 
 use super::super::PolicyError;
 use crate::compile::{CompileError, Fact, Segment};
+use crate::engine::Input;
 use crate::operators::{self, SharedTeam};
 
 /// The values of a tick.
@@ -29,7 +30,7 @@ impl Values {
     }
 
     /// The same; a new one holds zeros.
-    fn place(&mut self, name: &str, fact: Option<&Fact>) -> TractResult<Place> {
+    pub(super) fn place(&mut self, name: &str, fact: Option<&Fact>) -> TractResult<Place> {
         if let Some(place) = self.find(name) {
             return Ok(place);
         }
@@ -69,6 +70,17 @@ impl Values {
         }
         to.copy_from_slice(from);
         Ok(())
+    }
+
+    /// A value as another engine takes it.
+    pub(super) fn input(&self, Place(place): Place) -> TractResult<Input<'_>> {
+        let tensor = &self.tensors[place];
+        let view = tensor.try_as_plain_ram()?;
+        Ok(match tensor.datum_type() {
+            DatumType::U8 => Input::U8(view.as_slice()?),
+            DatumType::I64 => Input::I64(view.as_slice()?),
+            _ => Input::F32(view.as_slice()?),
+        })
     }
 
     /// Makes one value stand for another.
@@ -115,7 +127,7 @@ impl Piece {
             .map(|(name, fact)| values.place(name, Some(fact)))
             .collect::<TractResult<_>>()?;
         let outputs =
-            segment.outputs.iter().map(|name| values.place(name, None)).collect::<TractResult<_>>()?;
+            segment.outputs.iter().map(|(name, _)| values.place(name, None)).collect::<TractResult<_>>()?;
         Ok(Self { part: segment.part, inputs, outputs, state, unwanted: Some(Unwanted.into()) })
     }
 

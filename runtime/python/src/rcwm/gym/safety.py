@@ -61,7 +61,8 @@ class Safety:
         if (values < self.low - room).any() or (values > self.high + room).any():
             return Refused.OUT_OF_LIMITS
         # Limits come last: a robot may have been moved beyond them.
-        return np.clip(self._near(values), self.low, self.high).astype(np.float32)
+        inside: np.ndarray = np.clip(self._near(values), self.low, self.high)
+        return inside
 
     def rest(self, state: np.ndarray) -> np.ndarray | None:
         """The interface's safe action for a measured state; None where it is to hold a command and there was none.
