@@ -4,6 +4,7 @@
 //! | --- | --- |
 //! | [`mod@log`] | a logged run again, bit for bit; its times; its episodes |
 //! | [`film`] | films and strips of a logged run |
+//! | [`mod@mcap`] | a logged run for Foxglove, rerun and ROS 2 |
 //! | [`plot`] | latency by percentile as a picture |
 //! | [`bundle`] | a bundle of any library's ONNX policy |
 //! | [`inspect`] | what a bundle holds and what a tick costs |
@@ -17,4 +18,5 @@ pub mod cli;
 pub mod film;
 pub mod inspect;
 pub mod log;
+pub mod mcap;
 pub mod plot;
