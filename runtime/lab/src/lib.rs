@@ -7,6 +7,7 @@
 //! | [`mod@mcap`] | a logged run for Foxglove, rerun and ROS 2 |
 //! | [`plot`] | latency by percentile as a picture |
 //! | [`bundle`] | a bundle of any library's ONNX policy |
+//! | [`watch`] | a robot and its controller while they run |
 //! | [`inspect`] | what a bundle holds and what a tick costs |
 //! | [`mod@bench`] | the tick's latency on this machine, engines interleaved |
 //!
@@ -20,3 +21,4 @@ pub mod inspect;
 pub mod log;
 pub mod mcap;
 pub mod plot;
+pub mod watch;

@@ -8,6 +8,7 @@ mod inspect;
 mod plot;
 mod replay;
 mod telemetry;
+mod watch;
 
 use std::process::ExitCode;
 
@@ -31,6 +32,7 @@ Examples:
   rcwm-lab replay --log runs/demo.rcwmlog --bundle models/bundles/hammer
   rcwm-lab film --log runs/demo.rcwmlog --bundle models/bundles/hammer --out runs/demo
   rcwm-lab export-mcap --log runs/demo.rcwmlog --out runs/demo.mcap
+  rcwm-lab watch --instance demo
 
 Exit codes:
   0 done (also after Ctrl-C), 1 error or a replay that differs, 2 usage, 130 second Ctrl-C
@@ -54,6 +56,8 @@ enum Verb {
     ExportMcap(export_mcap::ExportMcapArguments),
     /// Shows the latencies of a logged run, and writes and draws them
     Telemetry(telemetry::TelemetryArguments),
+    /// Shows a robot and its controller while they run, in a terminal
+    Watch(watch::WatchArguments),
     /// Draws latency files (--hgrm) as a picture
     Plot(plot::PlotArguments),
 }
@@ -70,6 +74,7 @@ pub fn main() -> ExitCode {
         Verb::Film(arguments) => film::run(&arguments),
         Verb::ExportMcap(arguments) => export_mcap::run(&arguments),
         Verb::Telemetry(arguments) => telemetry::run(&arguments),
+        Verb::Watch(arguments) => watch::run(&arguments),
         Verb::Plot(arguments) => plot::run(&arguments),
     };
     // What standard output has lost is an error, too, but not the first to be told.
