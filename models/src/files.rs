@@ -1,10 +1,14 @@
 //! Files as a deployed system needs them: written atomically, read with a limit, checked by sha256.
 
+mod new;
+
 use std::ffi::OsString;
-use std::fs::{self, File, OpenOptions, Permissions};
+use std::fs::{self, File, OpenOptions};
 use std::io::{self, Read, Write};
-use std::os::unix::fs::{OpenOptionsExt, PermissionsExt};
+use std::os::unix::fs::OpenOptionsExt;
 use std::path::{Path, PathBuf};
+
+pub use new::NewFile;
 
 use rustix::fs::OFlags;
 use sha2::{Digest, Sha256};
@@ -129,12 +133,12 @@ pub fn write_atomic(path: &Path, bytes: &[u8]) -> Result<(), FileError> {
             let path = fs::canonicalize(path).map_err(FileError::io(path))?;
             let (temporary, folder) = written(&path, bytes)?;
             temporary.persist(&path).map_err(|error| FileError::io(&path)(error.error))?;
-            sync(&folder)
+            new::sync(&folder)
         }
         Err(_) => {
             let (temporary, folder) = written(path, bytes)?;
             temporary.persist(path).map_err(|error| FileError::io(path)(error.error))?;
-            sync(&folder)
+            new::sync(&folder)
         }
     }
 }
@@ -144,30 +148,17 @@ pub fn write_atomic(path: &Path, bytes: &[u8]) -> Result<(), FileError> {
 /// # Errors
 /// [`FileError::Exists`] or [`FileError::Io`].
 pub fn write_new(path: &Path, bytes: &[u8]) -> Result<(), FileError> {
-    let (temporary, folder) = written(path, bytes)?;
-    temporary.persist_noclobber(path).map_err(|error| match error.error.kind() {
-        io::ErrorKind::AlreadyExists => FileError::Exists { path: path.to_path_buf() },
-        _ => FileError::io(path)(error.error),
-    })?;
-    sync(&folder)
+    let mut file = NewFile::create(path)?;
+    file.write_all(bytes).map_err(FileError::io(path))?;
+    file.keep()
 }
 
 /// A temporary file beside `path` that holds `bytes` on the disk, and its folder.
 fn written(path: &Path, bytes: &[u8]) -> Result<(tempfile::NamedTempFile, PathBuf), FileError> {
-    let folder = folder_of(path);
-    // Readable for whom the umask lets read; temporary files are private to their owner by default.
-    let mut temporary = tempfile::Builder::new()
-        .prefix(".writing-")
-        .permissions(Permissions::from_mode(0o666))
-        .tempfile_in(&folder)
-        .map_err(FileError::io(path))?;
+    let mut temporary = new::temporary(path)?;
     temporary.write_all(bytes).map_err(FileError::io(path))?;
     temporary.as_file().sync_all().map_err(FileError::io(path))?;
-    Ok((temporary, folder))
-}
-
-fn sync(folder: &Path) -> Result<(), FileError> {
-    File::open(folder).and_then(|folder| folder.sync_all()).map_err(FileError::io(folder))
+    Ok((temporary, folder_of(path)))
 }
 
 fn folder_of(path: &Path) -> PathBuf {

@@ -36,6 +36,21 @@ impl ObservationFlags {
         self.0 & other.0 == other.0
     }
 
+    /// The names of all that are set.
+    pub fn names(self) -> impl Iterator<Item = &'static str> {
+        let all = [
+            (Self::FIRST, "first"),
+            (Self::LAST, "last"),
+            (Self::TERMINAL, "terminal"),
+            (Self::SUCCESS, "success"),
+            (Self::MASK_VALID, "mask"),
+            (Self::ACTION_HELD, "held"),
+            (Self::REPEATED, "repeated"),
+            (Self::PUSHED, "pushed"),
+        ];
+        all.into_iter().filter(move |(flag, _)| self.contains(*flag)).map(|(_, name)| name)
+    }
+
     /// These bits, with those of `other` set when `condition` holds.
     #[must_use]
     pub const fn with(self, other: Self, condition: bool) -> Self {
@@ -137,5 +152,9 @@ mod tests {
             .with(ObservationFlags::LAST, true)
             .with(ObservationFlags::FIRST, false);
         assert!(flags.contains(ObservationFlags::LAST) && !flags.contains(ObservationFlags::FIRST));
+        assert_eq!(
+            flags.with(ObservationFlags::PUSHED, true).names().collect::<Vec<_>>(),
+            ["last", "pushed"]
+        );
     }
 }

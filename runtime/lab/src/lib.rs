@@ -4,8 +4,10 @@
 //! | --- | --- |
 //! | [`mod@log`] | a logged run again, bit for bit; its times; its episodes |
 //! | [`film`] | films and strips of a logged run |
+//! | [`mod@mcap`] | a logged run for Foxglove, rerun and ROS 2 |
 //! | [`plot`] | latency by percentile as a picture |
 //! | [`bundle`] | a bundle of any library's ONNX policy |
+//! | [`watch`] | a robot and its controller while they run |
 //! | [`inspect`] | what a bundle holds and what a tick costs |
 //! | [`mod@bench`] | the tick's latency on this machine, engines interleaved |
 //!
@@ -17,4 +19,6 @@ pub mod cli;
 pub mod film;
 pub mod inspect;
 pub mod log;
+pub mod mcap;
 pub mod plot;
+pub mod watch;

@@ -12,6 +12,7 @@ use rand::{Rng, SeedableRng};
 use rand_chacha::ChaCha8Rng;
 use rcwm_lab::film::film;
 use rcwm_lab::log::{LoggedLatencies, ReplayError, ReplayReport, Replayer, write_episodes};
+use rcwm_lab::mcap::{Compression, export};
 use rcwm_lab::plot::{Curve, plot};
 use rcwm_models::bundle::Bundle;
 use rcwm_models::interface::Interface;
@@ -72,6 +73,8 @@ fn use_log(path: &Path) -> Result<ReplayReport, ReplayError> {
     }
     latencies.telemetry.write_hgrm(folder.path()).unwrap();
     write_episodes(&mut LogReader::open(path)?, folder.path(), &mut |_| true)?;
+    let file = folder.path().join("a.mcap");
+    export(&mut LogReader::open(path)?, &file, Compression::Lz4, None, &mut |_| true).unwrap();
     let mut log = LogReader::open(path)?;
     let report = Replayer::new(log.header(), &[bundle()], None)?.run(&mut log, &mut |_| true)?;
     assert!(!report.text().is_empty());

@@ -9,7 +9,8 @@ use rcwm_models::errors::one_line;
 use rcwm_models::programs::{MissingProgram, Program};
 
 /// Verbs that this program passes on.
-const VERBS: [&str; 7] = ["inspect", "bundle", "bench", "replay", "telemetry", "film", "plot"];
+const VERBS: [&str; 9] =
+    ["inspect", "bundle", "bench", "replay", "telemetry", "film", "export-mcap", "watch", "plot"];
 
 /// Runs rcwm-lab in this program's place where the command line names one of its verbs.
 pub(super) fn pass_on() -> Option<ExitCode> {

@@ -18,6 +18,10 @@ pub struct Header {
     pub program: String,
     /// Seconds since 1970 at the start.
     pub started_unix_s: u64,
+    /// What is to be added to times of CLOCK_MONOTONIC, in ns, for nanoseconds since 1970, as of the start; logs of older programs do not
+    /// say.
+    #[serde(default)]
+    pub monotonic_to_unix_ns: Option<i64>,
     /// The link's instance.
     pub instance: String,
     pub bundle: BundleIdentity,

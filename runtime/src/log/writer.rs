@@ -6,6 +6,7 @@ use std::path::{Path, PathBuf};
 use std::sync::Arc;
 use std::time::{Duration, Instant};
 
+use rcwm_models::wire::clock::monotonic_ns;
 use rcwm_models::wire::{Format, Observation};
 
 use super::LogError;
@@ -226,10 +227,11 @@ impl Sink for LogWriter {
 }
 
 fn header(policy: &Policy, settings: LogSettings) -> Header {
-    let since_1970 = std::time::SystemTime::now().duration_since(std::time::UNIX_EPOCH);
+    let since_1970 = std::time::SystemTime::now().duration_since(std::time::UNIX_EPOCH).unwrap_or_default();
     Header {
         program: env!("CARGO_PKG_VERSION").to_owned(),
-        started_unix_s: since_1970.map_or(0, |time| time.as_secs()),
+        started_unix_s: since_1970.as_secs(),
+        monotonic_to_unix_ns: i64::try_from(since_1970.as_nanos() as i128 - i128::from(monotonic_ns())).ok(),
         instance: settings.instance,
         bundle: BundleIdentity::of(policy.manifest()),
         engine: settings.engine,

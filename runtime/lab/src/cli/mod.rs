@@ -2,11 +2,13 @@
 
 mod bench;
 mod bundle;
+mod export_mcap;
 mod film;
 mod inspect;
 mod plot;
 mod replay;
 mod telemetry;
+mod watch;
 
 use std::process::ExitCode;
 
@@ -29,6 +31,8 @@ Examples:
   rcwm-lab bench --bundle models/bundles/hammer --engine all --ticks 2000
   rcwm-lab replay --log runs/demo.rcwmlog --bundle models/bundles/hammer
   rcwm-lab film --log runs/demo.rcwmlog --bundle models/bundles/hammer --out runs/demo
+  rcwm-lab export-mcap --log runs/demo.rcwmlog --out runs/demo.mcap
+  rcwm-lab watch --instance demo
 
 Exit codes:
   0 done (also after Ctrl-C), 1 error or a replay that differs, 2 usage, 130 second Ctrl-C
@@ -48,8 +52,12 @@ enum Verb {
     Replay(replay::ReplayArguments),
     /// Draws films, strips and episodes of a logged run
     Film(film::FilmArguments),
+    /// Writes a logged run as MCAP, which Foxglove, rerun and ROS 2 open
+    ExportMcap(export_mcap::ExportMcapArguments),
     /// Shows the latencies of a logged run, and writes and draws them
     Telemetry(telemetry::TelemetryArguments),
+    /// Shows a robot and its controller while they run, in a terminal
+    Watch(watch::WatchArguments),
     /// Draws latency files (--hgrm) as a picture
     Plot(plot::PlotArguments),
 }
@@ -64,7 +72,9 @@ pub fn main() -> ExitCode {
         Verb::Bench(arguments) => bench::run(&arguments),
         Verb::Replay(arguments) => replay::run(&arguments),
         Verb::Film(arguments) => film::run(&arguments),
+        Verb::ExportMcap(arguments) => export_mcap::run(&arguments),
         Verb::Telemetry(arguments) => telemetry::run(&arguments),
+        Verb::Watch(arguments) => watch::run(&arguments),
         Verb::Plot(arguments) => plot::run(&arguments),
     };
     // What standard output has lost is an error, too, but not the first to be told.

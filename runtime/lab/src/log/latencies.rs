@@ -71,35 +71,14 @@ impl LoggedLatencies {
     fn add(&mut self, record: &TickRecord) {
         self.report.ticks += 1;
         self.report.ticks_dropped = self.report.ticks_dropped.saturating_add(record.dropped_before);
-        for call in &record.calls {
-            match &call.outcome {
-                LoggedOutcome::Decided { stage_ns, .. } => self.telemetry.record_policy(stage_ns),
-                LoggedOutcome::Done(time_ns) => self.telemetry.record(Stage::Ahead, *time_ns),
-                _ => {}
-            }
+        for (stage, time_ns) in stage_times(record) {
+            self.telemetry.record(stage, time_ns);
         }
-        if record.overtaken {
-            self.report.overtaken += 1;
-            return;
-        }
-        let TickRecord { scheduled_ns, received_ns, .. } = *record;
-        let sent_ns = record.answer.published_ns;
-        let from_schedule_ns = sent_ns.saturating_sub(scheduled_ns);
-        let Some(observed) = &record.observed else {
-            self.telemetry.record(Stage::Imagine, sent_ns.saturating_sub(received_ns));
-            self.telemetry.record(Stage::FromSchedule, from_schedule_ns);
-            return;
-        };
-        let Observed { published_ns, period_ns, .. } = *observed;
-        self.telemetry.record(Stage::Receive, received_ns.saturating_sub(published_ns));
-        self.telemetry.record(Stage::Tick, sent_ns.saturating_sub(received_ns));
-        self.telemetry.record(Stage::EndToEnd, sent_ns.saturating_sub(published_ns));
-        // One that was sent again for us is older than we are.
-        if period_ns > 0 && !ObservationFlags(observed.flags).contains(ObservationFlags::REPEATED) {
+        self.report.overtaken += u64::from(record.overtaken);
+        if let Some(period_ns) = period_ns(record).filter(|_| !record.overtaken) {
+            let late = record.answer.published_ns.saturating_sub(record.scheduled_ns) > period_ns;
             self.report.period_us = Some(period_ns as f64 / 1e3);
-            self.telemetry.record(Stage::PublishLag, published_ns.saturating_sub(scheduled_ns));
-            self.telemetry.record(Stage::FromSchedule, from_schedule_ns);
-            self.report.late_answers += u64::from(from_schedule_ns > period_ns);
+            self.report.late_answers += u64::from(late);
         }
     }
 
@@ -118,4 +97,42 @@ impl LoggedLatencies {
         };
         format!("log        {ticks} ticks, {ticks_dropped} dropped; {pace}\n{}", table(latency))
     }
+}
+
+/// The control period where the observation came by a clock. One that was sent again for us is older than we are.
+fn period_ns(record: &TickRecord) -> Option<u64> {
+    let Observed { period_ns, flags, .. } = record.observed.as_ref()?;
+    let repeated = ObservationFlags(*flags).contains(ObservationFlags::REPEATED);
+    (*period_ns > 0 && !repeated).then_some(*period_ns)
+}
+
+/// Every time that a tick says, in ns. What was worked ahead took no time in the tick, and an answer that was not sent has none.
+pub(crate) fn stage_times(record: &TickRecord) -> Vec<(Stage, u64)> {
+    let mut times = Vec::new();
+    for call in &record.calls {
+        match &call.outcome {
+            LoggedOutcome::Decided { stage_ns, .. } => {
+                let stages = Stage::POLICY.into_iter().zip(stage_ns.iter().copied());
+                times.extend(stages.filter(|(_, time_ns)| *time_ns > 0));
+            }
+            LoggedOutcome::Done(time_ns) => times.push((Stage::Ahead, *time_ns)),
+            LoggedOutcome::StateSet(_) | LoggedOutcome::Failed(_) => {}
+        }
+    }
+    if record.overtaken {
+        return times;
+    }
+    let TickRecord { scheduled_ns, received_ns, answer, .. } = record;
+    let since = |ns: u64| answer.published_ns.saturating_sub(ns);
+    let Some(Observed { published_ns, .. }) = record.observed else {
+        times.extend([(Stage::Imagine, since(*received_ns)), (Stage::FromSchedule, since(*scheduled_ns))]);
+        return times;
+    };
+    times.push((Stage::Receive, received_ns.saturating_sub(published_ns)));
+    times.extend([(Stage::Tick, since(*received_ns)), (Stage::EndToEnd, since(published_ns))]);
+    if period_ns(record).is_some() {
+        times.push((Stage::PublishLag, published_ns.saturating_sub(*scheduled_ns)));
+        times.push((Stage::FromSchedule, since(*scheduled_ns)));
+    }
+    times
 }

@@ -6,12 +6,14 @@ mod replay;
 mod report;
 
 pub use episodes::{LoggedEpisode, WrittenEpisodes, write_episodes};
+pub(crate) use latencies::stage_times;
 pub use latencies::{LoggedLatencies, LoggedLatencyReport};
 pub use replay::Replayer;
 pub use report::{Answers, Difference, ReplayReport};
 
 use rcwm_models::bundle::BundleError;
 use rcwm_models::episode::EpisodeError;
+use rcwm_models::wire::ActionSource;
 use rcwm_runtime::PolicyError;
 use rcwm_runtime::log::LogError;
 
@@ -40,4 +42,14 @@ pub enum ReplayError {
     /// An episode could not be written.
     #[error(transparent)]
     Episode(#[from] EpisodeError),
+}
+
+/// What the controller was up to when it sent an answer of this source, as `docs/controller.md` names it.
+pub(crate) fn mode(source: u32) -> &'static str {
+    match ActionSource::from_wire(source) {
+        Some(ActionSource::Policy) => "tracking",
+        Some(ActionSource::Imagined) => "imagining",
+        Some(ActionSource::Fallback) => "fallback",
+        None => "unknown",
+    }
 }

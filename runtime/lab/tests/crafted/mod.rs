@@ -16,6 +16,7 @@ pub fn header(bundle: BundleIdentity) -> Header {
     Header {
         program: "test".into(),
         started_unix_s: 0,
+        monotonic_to_unix_ns: None,
         instance: "test".into(),
         bundle,
         engine: EngineSettings::tract(),
