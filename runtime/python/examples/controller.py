@@ -19,7 +19,7 @@ from rcwm.link import ControllerLink, Flags, Observation, PeerClosed
 
 
 def decide(observation: Observation, robot: Interface, generator: random.Random) -> np.ndarray:
-    """An action in the robot's units. `observation["image"]` is a camera's picture, `observation.state` what it measures."""
+    """An action in units. `observation["image"]` is a camera's picture, `observation.state` what is measured."""
     return np.array([generator.uniform(low, high) for low, high in zip(robot.low, robot.high, strict=True)])
 
 

@@ -8,6 +8,7 @@ endian), then the time of each `observe` (ns, u64). Every action is executed as 
 
 import sys
 import time
+from pathlib import Path
 
 import numpy as np
 
@@ -27,8 +28,7 @@ for tick, image in enumerate(images):
     actions[tick] = executed = decision.action
     computed_ns[tick] = sum(decision.stage_ns.values())
     policy.work_ahead(executed)
-with open(out, "wb") as file:
-    file.write(actions.tobytes() + times_ns.tobytes())
+Path(out).write_bytes(actions.tobytes() + times_ns.tobytes())
 for what, times in (("observe", times_ns), ("of it the parts", computed_ns), ("the rest", times_ns - computed_ns)):
     p50, p99 = np.percentile(times, [50, 99]) / 1e3
     print(f"{what:>16}: p50 {p50:8.1f} us, p99 {p99:8.1f} us")

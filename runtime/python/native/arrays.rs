@@ -16,13 +16,19 @@ pub(crate) struct Pixels(PyBuffer<u8>);
 
 impl Pixels {
     /// Looks at what was given as the `kind` (picture, mask) of this name: u8 of the shape. Raises `InputError`.
-    pub(crate) fn of(given: &Bound<'_, PyAny>, kind: &str, name: impl Display, shape: &[usize]) -> PyResult<Self> {
+    pub(crate) fn of(
+        given: &Bound<'_, PyAny>,
+        kind: &str,
+        name: impl Display,
+        shape: &[usize],
+    ) -> PyResult<Self> {
         let py = given.py();
         let given = with_buffer(given)?;
         let misfit = || {
             let found = given.getattr("shape").and_then(|shape| shape.extract::<Vec<usize>>());
             let dtype = given.getattr("dtype").map_or_else(|_| String::new(), |dtype| dtype.to_string());
-            let found = found.map_or_else(|_| given.get_type().to_string(), |shape| format!("{dtype} {shape:?}"));
+            let found =
+                found.map_or_else(|_| given.get_type().to_string(), |shape| format!("{dtype} {shape:?}"));
             input(py, format!("{kind} {name}: {found}; expected uint8 {shape:?}"))
         };
         let buffer = PyUntypedBuffer::get(&given).map_err(|_| misfit())?;

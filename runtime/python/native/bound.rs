@@ -30,7 +30,11 @@ impl<T> ThreadBound<T> {
         if thread::current().id() == self.thread {
             return Ok(&self.value);
         }
-        Err(error(py, "WrongThread", "an end of a link belongs to the thread that opened it; open and use it on one thread"))
+        Err(error(
+            py,
+            "WrongThread",
+            "an end of a link belongs to the thread that opened it; open and use it on one thread",
+        ))
     }
 
     /// The value, on any thread.

@@ -130,7 +130,10 @@ impl ControllerLink {
     #[pyo3(signature = (answers, numbers, source=0))]
     fn act(&self, py: Python<'_>, answers: u64, numbers: &Bound<'_, PyAny>, source: u32) -> PyResult<()> {
         if ActionSource::from_wire(source).is_none() {
-            return Err(input(py, format!("source {source}: expected 0 (policy), 1 (imagined) or 2 (fallback)")));
+            return Err(input(
+                py,
+                format!("source {source}: expected 0 (policy), 1 (imagined) or 2 (fallback)"),
+            ));
         }
         self.end.with(py, |link| {
             let nobody = || error(py, "LinkError", "there was no robot yet");

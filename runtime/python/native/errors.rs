@@ -7,7 +7,8 @@ use rcwm_runtime::PolicyError;
 
 /// An exception of `rcwm.errors`, by its name.
 pub(crate) fn error(py: Python<'_>, name: &str, text: impl ToString) -> PyErr {
-    let class = py.import("rcwm.errors").and_then(|module| Ok(module.getattr(name)?.cast_into::<PyType>()?));
+    let class =
+        py.import("rcwm.errors").and_then(|module| Ok(module.getattr(name)?.cast_into::<PyType>()?));
     match class {
         Ok(class) => PyErr::from_type(class, text.to_string()),
         Err(error) => error,

@@ -174,6 +174,9 @@ impl Observation {
     fn __repr__(&self) -> String {
         let view = self.view();
         let (sequence, episode, step) = (view.sequence, view.episode, view.step);
-        format!("Observation(sequence={sequence}, episode={episode}, step={step}: {})", self.keys().join(", "))
+        format!(
+            "Observation(sequence={sequence}, episode={episode}, step={step}: {})",
+            self.keys().join(", ")
+        )
     }
 }

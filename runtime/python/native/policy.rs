@@ -65,7 +65,8 @@ impl Policy {
     ) -> PyResult<R> {
         let done = py.detach(|| {
             // Who panicked has left it between two states.
-            let mut core = self.core.lock().map_err(|_| "the policy failed in an earlier call; load it again")?;
+            let mut core =
+                self.core.lock().map_err(|_| "the policy failed in an earlier call; load it again")?;
             Ok(work(core.as_mut().ok_or("the policy was closed")?))
         });
         done.map_err(|text: &str| error(py, "PolicyError", text))?.map_err(|why| policy_error(py, &why))
@@ -115,11 +116,7 @@ impl Policy {
 
     /// See `_rcwm.pyi`, as for all that follows.
     #[pyo3(signature = (inputs, executed=None))]
-    fn observe(
-        &self,
-        inputs: &Bound<'_, PyAny>,
-        executed: Option<&Bound<'_, PyAny>>,
-    ) -> PyResult<Decision> {
+    fn observe(&self, inputs: &Bound<'_, PyAny>, executed: Option<&Bound<'_, PyAny>>) -> PyResult<Decision> {
         let (mut pictures, mut state) = (Vec::with_capacity(self.inputs.len()), Vec::new());
         for wanted in &self.inputs {
             match wanted {
@@ -128,7 +125,12 @@ impl Policy {
                     pictures.push(Pixels::of(&given, "picture", name, shape)?.contiguous(&given)?);
                 }
                 Input::State { name, numbers } => {
-                    append_numbers(&self.given(inputs, name)?, format_args!("state {name}"), *numbers, &mut state)?;
+                    append_numbers(
+                        &self.given(inputs, name)?,
+                        format_args!("state {name}"),
+                        *numbers,
+                        &mut state,
+                    )?;
                 }
             }
         }

@@ -62,7 +62,8 @@ impl RobotLink {
         let text: String = robot.call_method0(py, "canonical")?.extract(py)?;
         let interface = Interface::parse(&text).map_err(|why| error(py, "InterfaceError", why))?;
         let (format, settings) = (Format::of(interface), LinkSettings::new(&instance));
-        let link = released(py, || SimulatorLink::open(settings, &format)).map_err(|why| link_error(py, &why))?;
+        let link =
+            released(py, || SimulatorLink::open(settings, &format)).map_err(|why| link_error(py, &why))?;
         let end = ThreadBound::new(RefCell::new(Some(End { link, published: None })), &Bin::new());
         Ok(Self { robot, instance, format, end })
     }
@@ -101,7 +102,10 @@ impl RobotLink {
         let found = wait(py, timeout_s, |time| self.with(py, |end| self.attempt(py, end, time)))?;
         let Some(action) = found else { return Ok(None) };
         let numbers = array(py, &action.action)?;
-        py.import("rcwm.messages")?.getattr("Answer")?.call1((action.answers, numbers, action.source)).map(Some)
+        py.import("rcwm.messages")?
+            .getattr("Answer")?
+            .call1((action.answers, numbers, action.source))
+            .map(Some)
     }
 
     #[getter]
@@ -149,9 +153,15 @@ fn fill_pixels(
     let known = |name: &str| robot.camera.iter().any(|camera| camera.name == name);
     let masked = |name: &str| robot.camera.iter().any(|camera| camera.name == name && camera.mask.is_some());
     let (given, given_masks) = (names(images)?, names(masks)?);
-    if given.len() != robot.camera.len() || !given.iter().all(|name| known(name)) || !given_masks.iter().all(|name| masked(name)) {
+    if given.len() != robot.camera.len()
+        || !given.iter().all(|name| known(name))
+        || !given_masks.iter().all(|name| masked(name))
+    {
         let cameras: Vec<_> = robot.camera.iter().map(|camera| camera.name.as_str()).collect();
-        return Err(input(py, format!("pictures {given:?}, masks {given_masks:?}; the robot's cameras are {cameras:?}")));
+        return Err(input(
+            py,
+            format!("pictures {given:?}, masks {given_masks:?}; the robot's cameras are {cameras:?}"),
+        ));
     }
     for (at, camera) in robot.camera.iter().enumerate() {
         let name = &camera.name;

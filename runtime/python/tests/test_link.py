@@ -193,9 +193,9 @@ def test_a_second_robot_and_a_second_controller_are_refused_in_one_line(pair, sm
     link, _ = pair
     with pytest.raises(LinkTaken, match="another simulator is already connected"):
         RobotLink(small, "a")
-    second = ControllerLink("a")
-    link.wait_action(0.01)
-    with pytest.raises(LinkTaken, match="another controller"):
+    # As soon as it knows the interface, which the robot says once more where it must.
+    with pytest.raises(LinkTaken, match="another controller"), ControllerLink("a") as second:
+        link.wait_action(0.01)
         second.observe(5)
 
 

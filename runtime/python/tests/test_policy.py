@@ -214,8 +214,10 @@ def test_a_policy_answers_a_robot_through_shared_memory(policy, monkeypatch, tmp
 
 def test_a_robot_that_a_policy_does_not_know_is_refused_by_name(policy, small, monkeypatch, tmp_path):
     monkeypatch.setenv("RCWM_PREFIX", f"rcwmtest{tmp_path.name[-8:]}_")
-    with RobotLink(small, "a") as link:
-        controller = ControllerLink("a", policy)
+    with (
+        RobotLink(small, "a") as link,
+        pytest.raises(DoesNotFit, match="robot small does not fit.*image"),
+        ControllerLink("a", policy) as controller,
+    ):
         link.wait_action(0.01)
-        with pytest.raises(DoesNotFit, match="robot small does not fit.*image"):
-            controller.observe(5)
+        controller.observe(5)

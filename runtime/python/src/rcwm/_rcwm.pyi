@@ -17,9 +17,7 @@ class Policy:
     Any thread may use it, one call after the other; other threads of Python run while it computes.
     """
 
-    def __init__(
-        self, bundle: str | os.PathLike[str], *, threads: int = 1, sample: int | None = None
-    ) -> None:
+    def __init__(self, bundle: str | os.PathLike[str], *, threads: int = 1, sample: int | None = None) -> None:
         """Loads and checks a bundle's folder. `threads`: 1 or 2 of a tick. `sample`: a seed of samples; without it the
         mean action. Raises `BundleError`, `PolicyError` and `InputError`.
         """
@@ -52,9 +50,7 @@ class Policy:
     def high(self) -> NDArray[np.float32]:
         """[action numbers]: the largest value of each."""
 
-    def observe(
-        self, inputs: Mapping[str, ArrayLike] | Observation, executed: ArrayLike | None = None
-    ) -> Decision:
+    def observe(self, inputs: Mapping[str, ArrayLike] | Observation, executed: ArrayLike | None = None) -> Decision:
         """Decides on one observation.
 
         `inputs` by name: a camera's picture [rows, columns, 3] u8, upright, RGB, which is read where it lies (do not

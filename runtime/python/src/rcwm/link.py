@@ -12,8 +12,8 @@ A controller of your own, and `rcwm.Policy` in it:
     observation = link.observe(1.0)
     link.act(observation.sequence, policy.observe(observation, executed).action)
 
-`ObserverLink` listens in. An end belongs to the thread that opened it; while it waits, other threads run. `rcwm.gym.serve`
-opens a robot's end by an instance's name.
+`ObserverLink` listens in. An end belongs to the thread that opened it; while it waits, other threads run.
+`rcwm.gym.serve` opens a robot's end by an instance's name.
 """
 
 from ._rcwm import ControllerLink, Observation, ObserverLink, RobotLink
