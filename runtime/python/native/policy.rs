@@ -3,7 +3,7 @@
 use std::path::PathBuf;
 use std::sync::{Mutex, PoisonError};
 
-use pyo3::exceptions::{PyKeyError, PyTypeError};
+use pyo3::exceptions::{PyIndexError, PyKeyError, PyTypeError};
 use pyo3::prelude::*;
 use pyo3::types::{PyDict, PyString};
 use rcwm_models::bundle::{Bundle, Manifest};
@@ -82,7 +82,7 @@ impl Policy {
             let expected = self.manifest.policy.inputs.join(", ");
             if why.is_instance_of::<PyKeyError>(py) {
                 input(py, format!("input {name} is missing; the policy reads {expected}"))
-            } else if why.is_instance_of::<PyTypeError>(py) {
+            } else if why.is_instance_of::<PyTypeError>(py) || why.is_instance_of::<PyIndexError>(py) {
                 let found = inputs.get_type();
                 input(py, format!("inputs: {found}; expected a dictionary of {expected}"))
             } else {

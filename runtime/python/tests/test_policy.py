@@ -132,6 +132,7 @@ def test_what_does_not_fit_is_refused_in_one_line(policy, inputs, line):
     assert isinstance(error.value, ValueError)
 
 
+@pytest.mark.filterwarnings("ignore:overflow")
 @pytest.mark.parametrize(
     ("executed", "line"),
     [
@@ -155,6 +156,25 @@ def test_numbers_of_any_type_are_an_action(policy):
     for same in (executed, tuple(executed), np.array(executed), expected[0], np.array(executed * 2, np.float32)[:4]):
         policy.observe({"image": images[0]})
         assert np.array_equal(policy.observe({"image": images[1]}, same).action, expected[1])
+
+
+def test_cameras_and_states_are_taken_by_name():
+    policy = Policy(BUNDLES / "panda-lift")
+    robot = policy.interface
+    random = np.random.default_rng(0)
+    given = {camera.name: random.integers(0, 256, camera.shape, np.uint8) for camera in robot.cameras}
+    given |= {state.name: random.normal(size=len(state.elements)) for state in robot.states}
+    assert set(policy.inputs) == set(given)
+    action = policy.observe(given).action
+    assert np.array_equal(policy.observe(dict(reversed(given.items()))).action, action)
+    front, wrist = (camera.name for camera in robot.cameras)
+    assert not np.array_equal(policy.observe(given | {front: given[wrist], wrist: given[front]}).action, action)
+    for state in robot.states:
+        assert not np.array_equal(policy.observe(given | {state.name: given[state.name] + 1}).action, action)
+        with pytest.raises(InputError, match=f"state {state.name}: 1 numbers, expected {len(state.elements)}"):
+            policy.observe(given | {state.name: [0.0]})
+        with pytest.raises(InputError, match=f"state {state.name}: .* is not finite"):
+            policy.observe(given | {state.name: given[state.name] * np.nan})
 
 
 def test_no_bundle_is_one_line(tmp_path):
