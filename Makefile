@@ -38,7 +38,7 @@ endif
 
 test: ## Everything that can be tested on one machine
 	@scripts/setup test
-	$(CARGO) build --release --locked --workspace --bins --examples
+	$(CARGO) build --release --locked --workspace --lib --bins --examples
 	ORT_DYLIB_PATH="$${ORT_DYLIB_PATH:-$$(scripts/onnxruntime-library)}" $(CARGO) test --release --locked --workspace
 
 lint: ## Formatting, clippy with warnings denied, licences (where cargo-deny is installed)

@@ -10,6 +10,7 @@ pub mod stream;
 use std::io::Read;
 use std::path::{Path, PathBuf};
 use std::process::{Child, Command, ExitStatus, Output, Stdio};
+use std::sync::OnceLock;
 use std::sync::atomic::{AtomicU32, Ordering};
 use std::time::{Duration, Instant};
 
@@ -37,7 +38,7 @@ pub fn shipped_bundle() -> PathBuf {
 /// A built binary of this workspace.
 ///
 /// # Panics
-/// When it was not built: `cargo build --release --workspace --bins`.
+/// When it was not built: `cargo build --release --workspace --lib --bins`.
 #[must_use]
 pub fn binary(name: &str) -> PathBuf {
     let own = std::env::current_exe().expect("a test has a path");
@@ -49,7 +50,7 @@ pub fn binary(name: &str) -> PathBuf {
     let path = folder.join(name);
     assert!(
         path.is_file(),
-        "{} is missing: build it first with `make test`, or cargo build --release --workspace --bins",
+        "{} is missing: build it first with `make test`, or cargo build --release --workspace --lib --bins",
         path.display()
     );
     path
@@ -66,10 +67,34 @@ pub fn python() -> PathBuf {
     path
 }
 
+/// The Python package with the native module that cargo has built: a folder for `PYTHONPATH`, as a wheel would be unpacked.
+///
+/// # Panics
+/// When the module was not built, or the folder cannot be made.
+#[must_use]
+pub fn python_package() -> tempfile::TempDir {
+    let folder = tempfile::tempdir().expect("a temporary folder");
+    let package = folder.path().join("rcwm");
+    std::fs::create_dir(&package).expect("a folder in a new folder");
+    let link = |from: &Path, name: &std::ffi::OsStr| {
+        std::os::unix::fs::symlink(from, package.join(name)).expect("a link in a new folder");
+    };
+    let sources = std::fs::read_dir(root().join("runtime/python/src/rcwm")).expect("the package's sources");
+    for path in sources.map(|entry| entry.expect("a readable folder").path()) {
+        // One that was built into the sources is older or newer than what is tested.
+        if path.extension().is_none_or(|extension| extension != "so") {
+            link(&path, path.file_name().expect("a name in a folder"));
+        }
+    }
+    link(&binary("librcwm_python.so"), "_rcwm.abi3.so".as_ref());
+    folder
+}
+
 /// A shared-memory domain that only this test uses.
 #[derive(Debug)]
 pub struct Domain {
     prefix: String,
+    package: OnceLock<tempfile::TempDir>,
 }
 
 impl Domain {
@@ -79,7 +104,7 @@ impl Domain {
     pub fn new() -> Self {
         static COUNT: AtomicU32 = AtomicU32::new(0);
         let prefix = format!("rcwm_t{}_{}_", std::process::id(), COUNT.fetch_add(1, Ordering::Relaxed));
-        Self { prefix }
+        Self { prefix, package: OnceLock::new() }
     }
 
     /// The prefix of its files.
@@ -100,11 +125,11 @@ impl Domain {
         self.within(Command::new(binary(name)))
     }
 
-    /// A command for a Python program in this domain.
+    /// A command for a Python program in this domain, which can import the package.
     #[must_use]
     pub fn python(&self, script: &Path) -> Command {
         let mut command = Command::new(python());
-        command.arg(script);
+        command.arg(script).env("PYTHONPATH", self.package.get_or_init(python_package).path());
         self.within(command)
     }
 

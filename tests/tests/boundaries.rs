@@ -62,6 +62,12 @@ fn the_lab_depends_on_neither_candle_nor_python() {
 }
 
 #[test]
+fn the_python_package_depends_on_python_and_not_on_candle() {
+    assert_without("rcwm-python", &[CANDLE, DRAWING]);
+    assert!(normal_dependencies("rcwm-python").iter().any(|name| name == "pyo3"), "it was looked at");
+}
+
+#[test]
 fn the_trainer_depends_on_neither_tract_nor_python() {
     assert_without("rcwm-trainer", &[TRACT, PYTHON]);
 }

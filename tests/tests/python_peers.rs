@@ -1,4 +1,4 @@
-//! The wire spoken from Python (`runtime/examples/python`), on either side.
+//! The link spoken from Python (`runtime/python`), on either side.
 
 use std::process::Command;
 use std::time::Duration;
@@ -25,7 +25,7 @@ fn a_python_controller_drives_the_simulator() {
     ]);
     command.arg(&left);
     let mut simulator = Running::start(command);
-    let mut command = domain.python(&root().join("runtime/examples/python/controller.py"));
+    let mut command = domain.python(&root().join("runtime/python/examples/controller.py"));
     command.args(["--instance", "python", "--json"]).arg(&right);
     let mut controller = Running::start(command);
     controller.succeed();
@@ -49,7 +49,7 @@ fn a_python_simulator_is_driven_by_the_runtime() {
     let mut command = domain.command("rcwm-runtime");
     command.args(["run", "--instance", "python", "--bundle"]).arg(shipped_bundle()).arg("--json").arg(&right);
     let mut runtime = Running::start(command);
-    let mut command = domain.python(&root().join("runtime/examples/python/simulator.py"));
+    let mut command = domain.python(&root().join("runtime/python/examples/simulator.py"));
     command.args(["--instance", "python", "--episodes", "2", "--steps", "30", "--json"]).arg(&left);
     let mut simulator = Running::start(command);
     simulator.succeed();
@@ -67,7 +67,7 @@ fn a_python_robot_is_told_that_its_controller_has_closed() {
     let mut command = domain.command("rcwm-runtime");
     command.args(["run", "--instance", "python", "--episodes", "1", "--bundle"]).arg(shipped_bundle());
     let mut runtime = Running::start(command);
-    let mut command = domain.python(&root().join("runtime/examples/python/simulator.py"));
+    let mut command = domain.python(&root().join("runtime/python/examples/simulator.py"));
     command.args(["--instance", "python", "--episodes", "2", "--steps", "5", "--timeout-s", "20"]);
     let simulator = output(command);
     runtime.succeed();
@@ -82,7 +82,7 @@ fn a_python_robot_executes_no_action_that_is_not_finite_or_out_of_range() {
     let (domain, folder) = (Domain::new(), tempfile::tempdir().unwrap());
     let left = folder.path().join("simulator.json");
     let controller = ControllerLink::open(domain.link("python"), |_| Vec::new()).unwrap();
-    let mut command = domain.python(&root().join("runtime/examples/python/simulator.py"));
+    let mut command = domain.python(&root().join("runtime/python/examples/simulator.py"));
     command.args(["--instance", "python", "--episodes", "1", "--steps", "3", "--json"]).arg(&left);
     let mut simulator = Running::start(command);
     let mut answers = 0;
@@ -104,23 +104,11 @@ fn a_python_robot_executes_no_action_that_is_not_finite_or_out_of_range() {
 }
 
 #[test]
-fn a_python_controller_sends_no_action_that_is_not_finite() {
-    let domain = Domain::new();
-    let script = "import rcwm_link as r; l = r.ControllerLink('python'); o = r.Observation();\n\
-                  for bad in ('nan', 'inf', '-inf'):\n try: l.act(o, [0, 0, float(bad), 0]); print('sent')\n except ValueError: print('refused')";
-    let mut command: Command = domain.python("-c".as_ref());
-    command.arg(script).env("PYTHONPATH", root().join("runtime/examples/python"));
-    let told = output(command);
-    assert_eq!(String::from_utf8_lossy(&told.stdout), "refused\n".repeat(3), "{told:?}");
-}
-
-#[test]
 fn a_robot_of_the_python_package_with_an_interface_of_its_own_is_driven() {
     let (domain, interface) = (Domain::new(), root().join("models/src/interface/arm.toml"));
     let script = "import sys, numpy as np\n\
-                  from rcwm.gym import Flags, Header\n\
                   from rcwm.interface import load\n\
-                  from rcwm.link import RobotLink\n\
+                  from rcwm.link import Flags, Header, RobotLink\n\
                   robot = load(sys.argv[1])\n\
                   link = RobotLink(robot, 'package')\n\
                   for step in range(3):\n \
@@ -132,7 +120,7 @@ fn a_robot_of_the_python_package_with_an_interface_of_its_own_is_driven() {
                   assert np.allclose(answer.action, [step / 10, -1]), answer\n\
                   link.close()";
     let mut command: Command = domain.python("-c".as_ref());
-    command.arg(script).arg(&interface).env("PYTHONPATH", root().join("runtime/python/src"));
+    command.arg(script).arg(&interface);
     let mut robot = Running::start(command);
     let controller = ControllerLink::open(domain.link("package"), |_| Vec::new()).unwrap();
     let format = controller.wait_robot(Duration::from_secs(20)).unwrap().expect("it says its interface");
@@ -154,7 +142,7 @@ fn a_robot_of_the_python_package_with_an_interface_of_its_own_is_driven() {
 
 #[test]
 fn an_episode_of_the_python_package_has_its_actions_from_limit_to_limit() {
-    let folder = tempfile::tempdir().unwrap();
+    let (domain, folder) = (Domain::new(), tempfile::tempdir().unwrap());
     let file = folder.path().join("episode.npz");
     let script = "import sys, numpy as np\n\
                   from pathlib import Path\n\
@@ -167,9 +155,9 @@ fn an_episode_of_the_python_package_has_its_actions_from_limit_to_limit() {
                   recorder.begin(seen)\n\
                   recorder.add(seen, np.float32([2.9, -0.85]), 1.0, True, False)\n\
                   recorder.finish().write(Path(sys.argv[2]))";
-    let mut command: Command = Domain::new().python("-c".as_ref());
+    let mut command: Command = domain.python("-c".as_ref());
     command.arg(script).arg(root().join("models/src/interface/arm.toml")).arg(&file);
-    command.env("PYTHONPATH", root().join("runtime/python/src"));
+    command;
     let told = output(command);
     assert!(told.status.success(), "{}", String::from_utf8_lossy(&told.stderr));
     let episode = rcwm_models::episode::Episode::read(&file).unwrap();
@@ -196,9 +184,7 @@ fn a_robot_of_one_s_own_in_python_is_driven_by_a_policy_for_its_interface() {
     command.args(["run", "--instance", "mine", "--bundle"]).arg(&bundle).arg("--json").arg(&json);
     let mut runtime = Running::start(command);
     let mut robot: Command = domain.python(&examples.join("robot.py"));
-    robot
-        .args(["--instance", "mine", "--episodes", "2"])
-        .env("PYTHONPATH", root().join("runtime/python/src"));
+    robot.args(["--instance", "mine", "--episodes", "2"]);
     let told = output(robot);
     assert!(told.status.success(), "{}", String::from_utf8_lossy(&told.stderr));
     let counts: serde_json::Value = serde_json::from_slice(&told.stdout).unwrap();

@@ -4,7 +4,7 @@
 
 use std::process::{Command, Output};
 
-use rcwm_tests::{Domain, binary, python, root, shipped_bundle};
+use rcwm_tests::{Domain, binary, python, python_package, root, shipped_bundle};
 
 /// Runs a script in a namespace whose shared memory is of so many KiB; none where the system grants no namespace.
 fn with_memory(kib: u32, domain: &Domain, script: &str) -> Option<Output> {
@@ -20,7 +20,9 @@ fn with_memory(kib: u32, domain: &Domain, script: &str) -> Option<Output> {
     let mut command = Command::new("unshare");
     command.args(flags).args(["sh", "-c", &format!("{mount} && {script}")]);
     command.env("RCWM_PREFIX", domain.prefix()).env("BUNDLE", shipped_bundle());
-    command.env("PYTHON", python()).env("EXAMPLES", root().join("runtime/examples/python"));
+    command.env("PYTHON", python()).env("EXAMPLES", root().join("runtime/python/examples"));
+    let package = python_package();
+    command.env("PYTHONPATH", package.path());
     command.env("RUNTIME", binary("rcwm-runtime")).env("SIMULATOR", binary("rcwm-simulator"));
     Some(command.output().unwrap())
 }

@@ -29,7 +29,7 @@ class Memory:
 
     def __init__(self, controller: Callable, clock: Time):
         self.controller, self.clock = controller, clock
-        self.seen, self.closed, self.asked = [], False, 0
+        self.seen, self.closed, self.asked, self.misfits = [], False, 0, 0
 
     def publish(self, header, state, executed, images, masks):
         self.seen.append((header, state.copy(), executed.copy(), images, masks))

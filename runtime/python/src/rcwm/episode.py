@@ -61,7 +61,7 @@ class Episode:
     def __len__(self) -> int:
         return len(self.reward)
 
-    def arrays(self) -> dict[str, np.ndarray]:
+    def arrays(self) -> dict[str, Any]:
         """What the file holds, by key."""
         out: dict[str, np.ndarray] = {}
         for index, camera in enumerate(self.interface.cameras):

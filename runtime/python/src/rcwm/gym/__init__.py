@@ -11,7 +11,9 @@ An observation is a dictionary by the interface's names of states and cameras (m
 vector; a single camera that is not in it is what the environment renders. `observe=` translates any other.
 """
 
-from .link import Answer, Clock, Flags, Header, Link, PeerClosed
+from ..errors import PeerClosed
+from ..messages import Answer, Flags, Header
+from .link import Clock, Link
 from .observe import UnfitEnvironment
 from .serve import Counts, NoAnswer, serve
 

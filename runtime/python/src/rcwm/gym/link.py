@@ -4,60 +4,19 @@ from __future__ import annotations
 
 import time
 from collections.abc import Mapping
-from dataclasses import dataclass, replace
-from enum import IntFlag
 from typing import Protocol
 
 import numpy as np
 
-from .. import RcwmError
-
-
-class Flags(IntFlag):
-    """Facts about an observation, as bits on the wire."""
-
-    FIRST = 1
-    LAST = 2
-    TERMINAL = 4
-    SUCCESS = 8
-    MASK_VALID = 16
-    ACTION_HELD = 32
-    REPEATED = 64
-    PUSHED = 128
-
-
-class PeerClosed(RcwmError):
-    """The controller has said that it sends no further action: the robot must come to rest."""
-
-
-@dataclass(frozen=True)
-class Header:
-    """What stands before an observation's numbers; times are CLOCK_MONOTONIC in ns, `period_ns` 0 in lock-step."""
-
-    sequence: int
-    episode: int
-    step: int
-    flags: Flags
-    reward: float
-    captured_ns: int
-    scheduled_ns: int
-    period_ns: int
-
-    def with_flag(self, flag: Flags) -> Header:
-        """The same with one flag more."""
-        return replace(self, flags=self.flags | flag)
-
-
-@dataclass(frozen=True)
-class Answer:
-    """A controller's answer to the observation of the sequence `answers`: [action numbers] f32, of any value."""
-
-    answers: int
-    action: np.ndarray
+from ..messages import Answer, Header
 
 
 class Link(Protocol):
     """The robot's end. Observations go out, answers come in; the newest wins."""
+
+    @property
+    def misfits(self) -> int:
+        """Answers of another length than the interface's, which `wait_action` does not give."""
 
     def publish(
         self,

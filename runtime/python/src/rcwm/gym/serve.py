@@ -12,9 +12,10 @@ from typing import Any
 
 import numpy as np
 
-from .. import RcwmError
+from ..errors import PeerClosed, RcwmError
 from ..interface import Interface
-from .link import Answer, Clock, Flags, Header, Link, PeerClosed
+from ..messages import Answer, Flags, Header
+from .link import Clock, Link
 from .observe import Observe, Seen, check_action_space, see
 from .safety import Refused, Safety
 
@@ -264,11 +265,14 @@ class _Loop:
     def _wait(self, deadline_ns: int) -> Answer | None:
         """One wait for an answer to the present observation; None does not mean that the time is up."""
         left_s = max(0.0, (deadline_ns - self.clock.now_ns()) / 1e9)
+        misfits = self.link.misfits
         try:
             answer = self.link.wait_action(left_s)
         except PeerClosed:
             self.counts.controllers_left += 1
             return None
+        finally:
+            self.counts.refused_length += self.link.misfits - misfits
         if answer is None:
             return None
         if answer.answers != self.sequence:

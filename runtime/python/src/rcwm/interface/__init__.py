@@ -8,9 +8,10 @@ byte for byte the Rust programs' form, and `Interface.hash` is what two peers co
     robot.action_numbers, robot.cameras[0].shape, robot.hash
 """
 
+from ..errors import InterfaceError
 from .checks import check
 from .compare import compare_names, differences
-from .model import Action, Camera, Interface, InterfaceError, State
+from .model import Action, Camera, Interface, State
 from .text import load, parse, with_cameras
 
 __all__ = [

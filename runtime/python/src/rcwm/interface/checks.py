@@ -8,6 +8,7 @@ from typing import NoReturn
 
 import numpy as np
 
+from ..errors import InterfaceError
 from .model import (
     ACTION_NUMBERS_MAX,
     CAMERAS_MAX,
@@ -20,7 +21,6 @@ from .model import (
     SIDE_MAX,
     Action,
     Interface,
-    InterfaceError,
 )
 
 

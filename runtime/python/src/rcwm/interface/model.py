@@ -11,16 +11,12 @@ from typing import Any
 
 import numpy as np
 
-from .. import RcwmError
+from ..errors import InterfaceError
 
 GROUPS_MAX, ELEMENTS_MAX, SIDE_MAX, NAME_MAX = 64, 1024, 4096, 64
 ACTION_NUMBERS_MAX, CAMERAS_MAX, OBSERVATION_BYTES_MAX = 64, 8, 256 << 20
 MODES = ("absolute", "delta", "velocity")
 RULES = ("hold", "hold-measured", "zero")
-
-
-class InterfaceError(RcwmError):
-    """A text that is no interface: what stands where, and what is expected."""
 
 
 @dataclass(frozen=True)

@@ -2,19 +2,15 @@
 
 from __future__ import annotations
 
-import sys
+import tomllib
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
+from ..errors import InterfaceError
 from .checks import check
-from .model import Action, Camera, Interface, InterfaceError, State
-
-if sys.version_info >= (3, 11):
-    import tomllib
-else:
-    import tomli as tomllib
+from .model import Action, Camera, Interface, State
 
 
 def load(path: str | Path) -> Interface:

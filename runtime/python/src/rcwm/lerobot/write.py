@@ -159,7 +159,7 @@ class _Writer:
     def _store_beside(self, episode: Episode, index: int) -> None:
         path = self.root / form.BESIDE.format(index=index)
         path.parent.mkdir(parents=True, exist_ok=True)
-        arrays = {key: value[-1:] for key, value in episode.arrays().items() if key.startswith("image")}
+        arrays: dict[str, Any] = {key: value[-1:] for key, value in episode.arrays().items() if key.startswith("image")}
         arrays |= {key: value for key, value in episode.arrays().items() if key.startswith("robot_mask")}
         arrays |= {"first": np.array([getattr(episode, key)[0] for key in form.NEXT.values()], np.float32)}
         arrays |= {"proprio": episode.proprio[-1:], "interface": np.array([episode.interface.canonical()])}
