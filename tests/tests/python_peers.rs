@@ -157,7 +157,6 @@ fn an_episode_of_the_python_package_has_its_actions_from_limit_to_limit() {
                   recorder.finish().write(Path(sys.argv[2]))";
     let mut command: Command = domain.python("-c".as_ref());
     command.arg(script).arg(root().join("models/src/interface/arm.toml")).arg(&file);
-    command;
     let told = output(command);
     assert!(told.status.success(), "{}", String::from_utf8_lossy(&told.stderr));
     let episode = rcwm_models::episode::Episode::read(&file).unwrap();

@@ -29,8 +29,10 @@ class Parser(argparse.ArgumentParser):
 def run(main: Callable[[], None]) -> None:
     """Runs a program: what a user can put right is one line and status 1; Ctrl-C and a closed pipe end it cleanly."""
     # A stop by a service manager, or a connection that ends, ends a program as Ctrl-C does: the peer is told.
-    for number in (signal.SIGTERM, signal.SIGHUP):
-        signal.signal(number, signal.default_int_handler)
+    # A shell's background jobs have Ctrl-C ignored, but may be sent it by name; what nohup ignores stays so.
+    for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
+        if number != signal.SIGHUP or signal.getsignal(number) != signal.SIG_IGN:
+            signal.signal(number, signal.default_int_handler)
     try:
         main()
         sys.stdout.flush()
