@@ -16,6 +16,7 @@ const CRATES: &[&str] = &[
     "runtime/src",
     "runtime/kernels/src",
     "runtime/lab/src",
+    "runtime/capi/src",
     "trainer/src",
     "trainer/gpu/src",
     "trainer/simulator/src",
