@@ -2,11 +2,13 @@
 //!
 //!     cargo run --release -p rcwm-benches --bin doors [-- --bundle DIR] [--door NAME=COMMAND]
 //!
-//! Rust and C take turns within one process, tick by tick, each with a policy of its own: the difference of the same tick is what the border
-//! costs. Then each program has the same inputs in a process of its own: the one in C that lies beside (`doors.c`, compiled here), and those
-//! named by `--door`. A program is given BUNDLE INPUTS OUT. INPUTS holds, a tick after the other, the bundle's pictures and then its states
-//! (f32), each in the order of `policy.inputs`. It feeds back what it decided, an episode long, with one thread. OUT gets all actions as
-//! little-endian f32, then the time of each `observe` as little-endian u64 in ns.
+//! Rust and C take turns within one process, tick by tick, each with a policy of its own: the difference of the same tick is what the
+//! border costs. Then each program has the same inputs in a process of its own: the one in C that lies beside (`doors.c`, compiled here),
+//! and those named by `--door`.
+//!
+//! A program is given BUNDLE INPUTS OUT. INPUTS holds, a tick after the other, the bundle's pictures and then its states (f32), each in
+//! the order of `policy.inputs`. It feeds back what it decided, one episode long, with one thread, and works ahead after each tick. OUT
+//! gets all actions as little-endian f32, then the time of each `observe` as little-endian u64 in ns.
 
 use std::ffi::CString;
 use std::path::{Path, PathBuf};
@@ -275,7 +277,15 @@ fn main() -> anyhow::Result<()> {
     let ticks = Ticks::new(&manifest, *count, arguments.seed);
     let [rust, c] = by_turns(bundle, &ticks)?;
 
-    outln!("{:<24} {:>9} {:>9} {:>9} {:>12} {:>11}   same bits", "observe, us", "p50", "p99", "max", "more: p50", "p99");
+    outln!(
+        "{:<24} {:>9} {:>9} {:>9} {:>12} {:>11}   same bits",
+        "observe, us",
+        "p50",
+        "p99",
+        "max",
+        "more: p50",
+        "p99"
+    );
     let mut rows = vec![row("Rust", &rust, &rust, false)?, row("C, by turns", &c, &rust, true)?];
     let folder = tempfile::tempdir()?;
     let [inputs, out] = ["inputs", "out"].map(|name| folder.path().join(name));
@@ -291,7 +301,9 @@ fn main() -> anyhow::Result<()> {
         std::fs::remove_file(&out)?;
     }
     if let Some(path) = &arguments.json {
-        let text = serde_json::to_string_pretty(&json!({ "bundle": bundle, "seed": arguments.seed, "doors": rows }))?;
+        let text = serde_json::to_string_pretty(
+            &json!({ "bundle": bundle, "seed": arguments.seed, "doors": rows }),
+        )?;
         rcwm_models::files::write_atomic(path, text.as_bytes())?;
     }
     let differs = rows.iter().find(|row| row["same_bits"] != *count);

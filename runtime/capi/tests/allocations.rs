@@ -36,7 +36,16 @@ fn a_tick_allocates_no_more_than_in_rust_and_decides_the_same() {
         let observe = || {
             // SAFETY: an open policy, and memory of ours.
             unsafe {
-                rcwm::rcwm_policy_observe(in_c, &raw const picture, 1, ptr::null(), 0, values, count, &raw mut decision)
+                rcwm::rcwm_policy_observe(
+                    in_c,
+                    &raw const picture,
+                    1,
+                    ptr::null(),
+                    0,
+                    values,
+                    count,
+                    &raw mut decision,
+                )
             }
         };
         let (c, code) = allocations(observe);
@@ -50,9 +59,13 @@ fn a_tick_allocates_no_more_than_in_rust_and_decides_the_same() {
         let (rust, ahead) = allocations(|| in_rust.work_ahead(executed.as_ref()));
         ahead.unwrap();
         // SAFETY: an open policy, and numbers of ours.
-        let work = || unsafe { rcwm::rcwm_policy_work_ahead(in_c, decided.action.as_ptr(), decided.action.len()) };
+        let work =
+            || unsafe { rcwm::rcwm_policy_work_ahead(in_c, decided.action.as_ptr(), decided.action.len()) };
         let (c, code) = allocations(work);
-        assert!(code == Code::RcwmOk && (step < 5 || c == rust), "step {step}: {c} allocations, {rust} in Rust");
+        assert!(
+            code == Code::RcwmOk && (step < 5 || c == rust),
+            "step {step}: {c} allocations, {rust} in Rust"
+        );
     }
     // SAFETY: opened above, and not used any more.
     assert_eq!(unsafe { rcwm::rcwm_policy_close(in_c) }, Code::RcwmOk);

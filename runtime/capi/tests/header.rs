@@ -5,21 +5,15 @@
 mod support;
 
 use std::collections::BTreeSet;
-use std::path::PathBuf;
+use std::path::Path;
 use std::process::Command;
 
 use support::{built, folder, succeed};
 
-/// In the order in which the header tells of them.
-const SOURCES: [&str; 6] =
-    ["code.rs", "policy.rs", "robot/mod.rs", "robot/observation.rs", "robot/serve.rs", "robot/own_loop.rs"];
-
 fn generated() -> String {
     let config = cbindgen::Config::from_file(folder().join("cbindgen.toml")).unwrap();
-    let mut builder = cbindgen::Builder::new().with_config(config);
-    for source in SOURCES {
-        builder = builder.with_src(folder().join("src").join(source));
-    }
+    // It follows the modules.
+    let builder = cbindgen::Builder::new().with_config(config).with_src(folder().join("src/lib.rs"));
     let mut text = Vec::new();
     builder.generate().unwrap().write(&mut text);
     String::from_utf8(text).unwrap()
@@ -61,7 +55,7 @@ fn declared() -> BTreeSet<String> {
     called.filter(|name| name.starts_with("rcwm_")).collect()
 }
 
-fn exported(library: &PathBuf) -> BTreeSet<String> {
+fn exported(library: &Path) -> BTreeSet<String> {
     let listed = succeed(Command::new("nm").args(["-D", "--defined-only"]).arg(library));
     listed.lines().filter_map(|line| line.split_whitespace().nth(2)).map(str::to_owned).collect()
 }
@@ -82,7 +76,8 @@ fn the_shared_library_is_told_by_its_minor_version() {
     // Nothing that a machine with a C library lacks.
     let needed = dynamic.lines().filter(|line| line.contains("(NEEDED)"));
     for line in needed {
-        let known = ["libc.so", "libm.so", "libgcc_s.so", "ld-linux", "libpthread.so", "libdl.so", "librt.so"];
+        let known =
+            ["libc.so", "libm.so", "libgcc_s.so", "ld-linux", "libpthread.so", "libdl.so", "librt.so"];
         assert!(known.iter().any(|name| line.contains(name)), "{line}");
     }
 }

@@ -5,7 +5,7 @@
 
 mod support;
 
-use std::path::PathBuf;
+use std::path::{Path, PathBuf};
 use std::process::Command;
 
 use rcwm_tests::{Domain, Observer, Running, read_json, shipped_bundle};
@@ -17,7 +17,7 @@ fn table() -> PathBuf {
 }
 
 /// The controller of an instance; it ends with its robot.
-fn controller(domain: &Domain, json: &std::path::Path) -> Running {
+fn controller(domain: &Domain, json: &Path) -> Running {
     let mut command = domain.command("rcwm-runtime");
     command.args(["run", "--instance", "table", "--timeout", "120", "--bundle"]).arg(shipped_bundle());
     Running::start({
@@ -26,7 +26,7 @@ fn controller(domain: &Domain, json: &std::path::Path) -> Running {
     })
 }
 
-fn in_domain(domain: &Domain, program: &PathBuf) -> Command {
+fn in_domain(domain: &Domain, program: &Path) -> Command {
     let mut command = Command::new(program);
     command.env("RCWM_PREFIX", domain.prefix());
     command
@@ -48,7 +48,10 @@ fn the_robot_in_cpp_is_driven_in_lockstep_and_in_real_time() {
         assert!(realtime || text.contains("answers 32, rests 0, missed 0"), "{text}");
         runtime.succeed();
         let report = read_json(&json);
-        assert_eq!((&report["whole_episodes"], &report["counters"]["refused_observations"]), (&2.into(), &0.into()));
+        assert_eq!(
+            (&report["whole_episodes"], &report["counters"]["refused_observations"]),
+            (&2.into(), &0.into())
+        );
         assert!(realtime || report["counters"]["answers"] == 32, "{report}");
         assert_eq!(domain.leftovers(), Vec::<String>::new());
     }
@@ -65,6 +68,7 @@ fn ctrl_c_brings_the_robot_in_cpp_to_rest_and_tells_the_controller() {
     robot.arg("table").arg(table()).args(["0", "0"]);
     let mut robot = Running::start(robot);
     observer.wait_for(|observation| observation.step >= 20);
+    drop(observer);
     robot.signal(Signal::INT);
     robot.succeed();
     assert!(robot.printed().contains("episodes 0, observations "), "{}", robot.printed());
@@ -79,7 +83,10 @@ fn robots_that_fail_come_to_rest_and_say_why() {
         ("throws", "RCWM_ERROR_ROBOT: the robot failed in episode 0: the brakes are on"),
         ("throws-a-number", "an exception that is no std::exception"),
         ("no-camera", "the robot has no camera of this number"),
-        ("nan", "RCWM_ERROR_NOT_FINITE: the robot measured a number that is not finite at step 2 of episode 0"),
+        (
+            "nan",
+            "RCWM_ERROR_NOT_FINITE: the robot measured a number that is not finite at step 2 of episode 0",
+        ),
         ("reenters", "index is null"),
         ("stops", ""),
         ("own-loop", "answers 12"),

@@ -124,7 +124,9 @@ pub fn serve(
         runs: false,
     };
     // A panic of the robot's program is caught until both are told, and then goes on.
-    let served_all = || (0..settings.episodes).try_for_each(|episode| loop_.episode(episode));
+    let goes_on = |_: &u64| !stop.load(Ordering::Relaxed);
+    let served_all =
+        || (0..settings.episodes).take_while(goes_on).try_for_each(|episode| loop_.episode(episode));
     let result = catch_unwind(AssertUnwindSafe(served_all));
     // The controller first, then the robot: neither is left with the last command.
     let Loop { robot, mut guard, observation, link, served, runs, .. } = loop_;
@@ -160,9 +162,6 @@ impl Loop<'_> {
     }
 
     fn episode(&mut self, episode: u64) -> Result<(), ServeError> {
-        if self.stopped() {
-            return Ok(());
-        }
         let failed = |source| ServeError::Robot { episode, source };
         self.robot.reset(episode).map_err(failed)?;
         let (mut executed, mut held) = (ActionValues::default(), false);
@@ -256,7 +255,7 @@ impl Loop<'_> {
             if left.is_zero() {
                 return Err(ServeError::NoAnswer { timeout_s: self.settings.timeout.as_secs_f64() });
             }
-            if let Some(answer) = self.wait(left.min(WAIT_SLICE))? {
+            if let Some(answer) = self.wait(left.min(WAIT_SLICE), true)? {
                 return Ok(Some(answer));
             }
         }
@@ -268,7 +267,7 @@ impl Loop<'_> {
         let until_ns = due_ns + self.period_ns.saturating_sub(self.work_ns).max(self.period_ns / 10);
         while !self.stopped() {
             let left = Duration::from_nanos(until_ns.saturating_sub(monotonic_ns()));
-            if let Some(answer) = self.wait(left.min(WAIT_SLICE))? {
+            if let Some(answer) = self.wait(left.min(WAIT_SLICE), false)? {
                 return Ok(Some(answer));
             }
             if left.is_zero() {
@@ -279,8 +278,9 @@ impl Loop<'_> {
         Ok(None)
     }
 
-    /// One wait for an answer to the present observation; none does not mean that the time is up.
-    fn wait(&mut self, timeout: Duration) -> Result<Option<Action>, ServeError> {
+    /// One wait for an answer to the present observation; none does not mean that the time is up. Where time stands still, the observation is
+    /// due whenever a controller comes: one that was due long ago is stale to it.
+    fn wait(&mut self, timeout: Duration, time_stands_still: bool) -> Result<Option<Action>, ServeError> {
         let misfits = self.link.misfits();
         let (wait, events) = self.link.wait_action(timeout)?;
         self.served.refused += self.link.misfits() - misfits;
@@ -288,6 +288,9 @@ impl Loop<'_> {
         if events.hello {
             // It has not seen the present observation.
             self.observation.flags |= ObservationFlags::REPEATED.0;
+            if time_stands_still {
+                self.observation.scheduled_ns = monotonic_ns();
+            }
             self.link.publish_copy(&self.observation)?;
         }
         let Wait::Message(action) = wait else { return Ok(None) };

@@ -186,10 +186,8 @@ impl Own {
 /// Begins an observation in a loop of your own: gives the places to be filled, which are good until rcwm_robot_publish(). Sequence,
 /// episode and step are counted by the library; RCWM_FLAG_FIRST is set at the first observation, and after one with RCWM_FLAG_LAST.
 ///
-/// ```text
-/// rcwm_robot_begin   ->  fill in pictures, states, flags, reward, and what was executed since
-/// rcwm_robot_publish ->  rcwm_robot_wait  ->  execute the action, or rcwm_robot_rest where none has come
-/// ```
+/// In each round: rcwm_robot_begin(); fill in pictures, states, flags, reward, and what was executed since; rcwm_robot_publish();
+/// rcwm_robot_wait(); execute the action, or what rcwm_robot_rest() gives where none has come.
 ///
 /// Fails with RCWM_ERROR_STATE or RCWM_ERROR_ARGUMENT.
 #[unsafe(no_mangle)]

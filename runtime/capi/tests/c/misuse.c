@@ -41,6 +41,14 @@ static void proc_line(const char *file, const char *key, char *to, size_t size) 
     if (from) fclose(from);
 }
 
+/* The signals that this process handles, but for the C library's own two, which come with its first thread. */
+static unsigned long long handled(void) {
+    char line[256];
+    proc_line("/proc/self/status", "SigCgt:", line, sizeof line);
+    HOLDS(line[0] != 0);
+    return strtoull(line + strlen("SigCgt:"), NULL, 16) & ~(3ull << 31);
+}
+
 /* Threads of this process with this name, and whether each takes SIGINT. */
 static int threads_named(const char *name, int *that_take_signals) {
     int found = 0;
@@ -61,7 +69,7 @@ static int threads_named(const char *name, int *that_take_signals) {
 }
 
 static void policies(const char *bundle) {
-    char before[256], after[256];
+    char blocked[256];
     rcwm_policy *policy = (rcwm_policy *)image;
     EXPECT(rcwm_policy_open(bundle, NULL, NULL), RCWM_ERROR_ARGUMENT, "policy is null");
     EXPECT(rcwm_policy_open(NULL, NULL, &policy), RCWM_ERROR_ARGUMENT, "folder is null");
@@ -79,15 +87,14 @@ static void policies(const char *bundle) {
     SUCCEED(rcwm_policy_open(bundle, &newer.known, &policy));
     SUCCEED(rcwm_policy_close(policy));
 
-    proc_line("/proc/self/status", "SigCgt:", before, sizeof before);
+    const unsigned long long before = handled();
     options = (rcwm_policy_options){.size = sizeof options, .threads = 2};
     SUCCEED(rcwm_policy_open(bundle, &options, &policy));
-    proc_line("/proc/self/status", "SigCgt:", after, sizeof after);
-    HOLDS(before[0] != 0 && strcmp(before, after) == 0);
+    HOLDS(handled() == before);
     int that_take_signals = 0;
     HOLDS(threads_named("rcwm-tick", &that_take_signals) == 1 && that_take_signals == 0);
-    proc_line("/proc/self/status", "SigBlk:", after, sizeof after);
-    HOLDS(strtoull(after + strlen("SigBlk:"), NULL, 16) == 0);
+    proc_line("/proc/self/status", "SigBlk:", blocked, sizeof blocked);
+    HOLDS(strtoull(blocked + strlen("SigBlk:"), NULL, 16) == 0);
 
     rcwm_policy_info info = {.size = sizeof info};
     SUCCEED(rcwm_policy_get_info(policy, &info));
@@ -159,7 +166,6 @@ static int32_t execute(void *user, const float *action, float *executed, size_t 
 }
 
 static void robots(const char *instance, const char *file, const char *broken) {
-    char before[256], after[256];
     rcwm_robot *robot = (rcwm_robot *)image, *second = NULL;
     rcwm_robot_options options = {.size = sizeof options, .instance = instance};
     EXPECT(rcwm_robot_open(&options, NULL), RCWM_ERROR_ARGUMENT, "robot is null");
@@ -180,10 +186,9 @@ static void robots(const char *instance, const char *file, const char *broken) {
     EXPECT(rcwm_robot_open(&options, &robot), RCWM_ERROR_ARGUMENT, "no prefix");
     options.prefix = NULL;
 
-    proc_line("/proc/self/status", "SigCgt:", before, sizeof before);
+    const unsigned long long before = handled();
     SUCCEED(rcwm_robot_open(&options, &robot));
-    proc_line("/proc/self/status", "SigCgt:", after, sizeof after);
-    HOLDS(before[0] != 0 && strcmp(before, after) == 0);
+    HOLDS(handled() == before);
     EXPECT(rcwm_robot_open(&options, &second), RCWM_ERROR_LINK, "another simulator");
     HOLDS(second == NULL);
 

@@ -5,7 +5,7 @@
 
 use std::path::{Path, PathBuf};
 use std::process::{Command, Output};
-use std::sync::OnceLock;
+use std::sync::{Mutex, OnceLock, PoisonError};
 
 /// The crate's own.
 pub fn folder() -> PathBuf {
@@ -77,10 +77,15 @@ fn programs() -> &'static Path {
     FOLDER.get_or_init(|| tempfile::tempdir().unwrap()).path()
 }
 
-/// Compiles a program of `examples` or `tests/c` against the installed library.
+/// Compiles a program of `examples` or `tests/c` against the installed library, once.
 pub fn compile(source: &str) -> PathBuf {
+    static COMPILES: Mutex<()> = Mutex::new(());
+    let _one_at_a_time = COMPILES.lock().unwrap_or_else(PoisonError::into_inner);
     let source = folder().join(source);
     let program = programs().join(source.file_stem().unwrap());
+    if program.exists() {
+        return program;
+    }
     let mut command = compiler(&source);
     command.args(sanitizers()).args(pkg_config(&["--cflags"])).arg(&source).args(pkg_config(&["--libs"]));
     command.arg(format!("-Wl,-rpath,{}", installed().join("lib").display())).arg("-o").arg(&program);
@@ -94,7 +99,8 @@ pub fn compile_static(source: &str) -> PathBuf {
     let program = programs().join("static");
     let libraries = pkg_config(&["--static", "--libs"]);
     // The shared one lies beside it.
-    let libraries = libraries.into_iter().map(|word| if word == "-lrcwm" { "-l:librcwm.a".into() } else { word });
+    let libraries =
+        libraries.into_iter().map(|word| if word == "-lrcwm" { "-l:librcwm.a".into() } else { word });
     let mut command = compiler(&source);
     command.args(pkg_config(&["--cflags"])).arg(&source).args(libraries).arg("-o").arg(&program);
     succeed(&mut command);
