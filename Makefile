@@ -16,7 +16,7 @@ ROBOT ?=
 STATE ?= joints
 BIN = $${CARGO_TARGET_DIR:-target}/release
 
-.PHONY: help demo learn test lint clean
+.PHONY: help demo learn test lint install-capi clean
 
 help: ## What there is
 	@grep -hE '^[a-z-]+:.*##' $(MAKEFILE_LIST) | sed -E 's/:.*## /\t/' | expand -t 10
@@ -47,6 +47,9 @@ lint: ## Formatting, clippy with warnings denied, licences (where cargo-deny is 
 	$(CARGO) clippy --release --locked --workspace --all-targets -- -D warnings
 	@if $(CARGO) deny --version >/dev/null 2>&1; then $(CARGO) deny check bans licenses sources; \
 	else echo "lint: cargo-deny is not installed, licences were not checked (cargo install cargo-deny)"; fi
+
+install-capi: ## librcwm for C and C++: headers, libraries, pkg-config and CMake files under PREFIX
+	@scripts/install-capi "$(or $(PREFIX),$(error name a folder: make install-capi PREFIX=$$HOME/.local))"
 
 clean: ## Remove what was built and installed here
 	rm -rf target .venv runs

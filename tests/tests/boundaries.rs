@@ -57,6 +57,11 @@ fn what_runs_on_a_robot_depends_on_neither_candle_nor_python_and_draws_nothing()
 }
 
 #[test]
+fn the_library_for_c_depends_on_neither_candle_nor_python_and_draws_nothing() {
+    assert_without("rcwm-capi", &[CANDLE, PYTHON, DRAWING]);
+}
+
+#[test]
 fn the_lab_depends_on_neither_candle_nor_python() {
     assert_without("rcwm-lab", &[CANDLE, PYTHON]);
 }
@@ -79,8 +84,8 @@ fn the_simulator_depends_on_neither_candle_nor_tract() {
 
 #[test]
 fn what_the_demo_compiles_is_not_compiled_again_for_learning() {
-    let demo = ["rcwm-simulator", "rcwm-runtime", "rcwm-lab"];
-    let learning = [demo[0], demo[1], demo[2], "rcwm-trainer"];
+    let demo = ["rcwm-simulator", "rcwm-runtime", "rcwm-lab", "rcwm-capi"];
+    let learning = [demo[0], demo[1], demo[2], demo[3], "rcwm-trainer"];
     // What is linked, and all that is built, procedural macros included: a crate may be both, with other features.
     for edges in ["normal,no-proc-macro", "normal,build"] {
         let with_features = |packages: &[&str]| tree(packages, edges, "{p} with {f}");

@@ -17,6 +17,7 @@ const CRATES: &[&str] = &[
     "runtime/kernels/src",
     "runtime/lab/src",
     "runtime/python/native",
+    "runtime/capi/src",
     "trainer/src",
     "trainer/gpu/src",
     "trainer/simulator/src",

@@ -253,6 +253,11 @@ impl DerefMut for ObservationMut<'_> {
 }
 
 impl ObservationMut<'_> {
+    /// See [`Observation::payload`].
+    pub fn payload(&mut self) -> &mut [u8] {
+        self.payload
+    }
+
     /// See [`Observation::state`].
     pub fn state(&mut self) -> &mut [f32] {
         cast_slice_mut(&mut self.payload[self.format.layout().state.bytes.clone()])

@@ -134,7 +134,9 @@ pub fn serve(
         moves: false,
     };
     // A panic of the robot's program is caught until both are told, and then goes on.
-    let served_all = || (0..settings.episodes).try_for_each(|episode| loop_.episode(episode));
+    let goes_on = |_: &u64| !stop.load(Ordering::Relaxed);
+    let served_all =
+        || (0..settings.episodes).take_while(goes_on).try_for_each(|episode| loop_.episode(episode));
     let result = catch_unwind(AssertUnwindSafe(served_all));
     // The controller first, then the robot: neither is left with the last command.
     let closed = loop_.link.say_closed();
@@ -186,9 +188,6 @@ impl Loop<'_> {
     }
 
     fn episode(&mut self, episode: u64) -> Result<(), ServeError> {
-        if self.stopped() {
-            return Ok(());
-        }
         self.robot.reset(episode).map_err(|source| ServeError::Robot { episode, source })?;
         let (mut executed, mut held) = (ActionValues::default(), false);
         // None before the first answer: until then time stands still.
@@ -345,8 +344,9 @@ impl Loop<'_> {
         Ok(None)
     }
 
-    /// One wait for an answer to the present observation; none does not mean that the time is up.
-    fn wait(&mut self, timeout: Duration) -> Result<Option<Action>, ServeError> {
+    /// One wait for an answer to the present observation; none does not mean that the time is up. Where time stands still, the observation is
+    /// due whenever a controller comes: one that was due long ago is stale to it.
+    fn wait(&mut self, timeout: Duration, time_stands_still: bool) -> Result<Option<Action>, ServeError> {
         let misfits = self.link.misfits();
         let (wait, events) = self.link.wait_action(timeout)?;
         self.served.refused += self.link.misfits() - misfits;
@@ -354,6 +354,9 @@ impl Loop<'_> {
         if events.hello {
             // It has not seen the present observation.
             self.observation.flags |= ObservationFlags::REPEATED.0;
+            if time_stands_still {
+                self.observation.scheduled_ns = monotonic_ns();
+            }
             self.link.publish_copy(&self.observation)?;
         }
         let Wait::Message(action) = wait else { return Ok(None) };
