@@ -344,9 +344,8 @@ impl Loop<'_> {
         Ok(None)
     }
 
-    /// One wait for an answer to the present observation; none does not mean that the time is up. Where time stands still, the observation is
-    /// due whenever a controller comes: one that was due long ago is stale to it.
-    fn wait(&mut self, timeout: Duration, time_stands_still: bool) -> Result<Option<Action>, ServeError> {
+    /// One wait for an answer to the present observation; none does not mean that the time is up.
+    fn wait(&mut self, timeout: Duration) -> Result<Option<Action>, ServeError> {
         let misfits = self.link.misfits();
         let (wait, events) = self.link.wait_action(timeout)?;
         self.served.refused += self.link.misfits() - misfits;
@@ -354,9 +353,6 @@ impl Loop<'_> {
         if events.hello {
             // It has not seen the present observation.
             self.observation.flags |= ObservationFlags::REPEATED.0;
-            if time_stands_still {
-                self.observation.scheduled_ns = monotonic_ns();
-            }
             self.link.publish_copy(&self.observation)?;
         }
         let Wait::Message(action) = wait else { return Ok(None) };

@@ -170,29 +170,6 @@ fn in_real_time_a_robot_that_is_left_rests_and_goes_on() {
 }
 
 #[test]
-fn in_real_time_a_controller_that_comes_late_finds_an_observation_that_is_due_now() {
-    let (settings, _domain) = domain("late");
-    let link = SimulatorLink::open(settings.clone(), &arm()).unwrap();
-    let serving = ServeSettings { episodes: 1, steps: 2, realtime: true, ..LOCKSTEP };
-    let (came_ns, due_ns) = std::thread::scope(|scope| {
-        let controller = scope.spawn(|| {
-            std::thread::sleep(Duration::from_millis(200));
-            let came_ns = monotonic_ns();
-            let controller = ControllerLink::open(settings, anything).unwrap();
-            let Wait::Message(observation) = controller.wait_observation(SOON).unwrap() else { panic!() };
-            let action = [0.5, -0.5].into();
-            controller
-                .send(&Action { answers: observation.sequence, published_ns: 0, source: 0, action })
-                .unwrap();
-            (came_ns, observation.scheduled_ns)
-        });
-        serve(&mut Joints::default(), link, &serving, &AtomicBool::new(false)).unwrap();
-        controller.join().unwrap()
-    });
-    assert!(due_ns >= came_ns, "due {} ns before the controller came", came_ns - due_ns);
-}
-
-#[test]
 fn stopped_it_ends_however_many_episodes_there_were_to_be() {
     let (settings, _domain) = domain("stopped");
     let link = SimulatorLink::open(settings, &arm()).unwrap();
