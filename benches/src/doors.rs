@@ -17,7 +17,6 @@ use std::time::Instant;
 
 use anyhow::{Context, bail, ensure};
 use clap::Parser;
-use hdrhistogram::Histogram;
 use rand::{RngCore, SeedableRng};
 use rand_chacha::ChaCha8Rng;
 use rcwm_models::bundle::{Bundle, Manifest};
@@ -240,28 +239,24 @@ fn through(
     })
 }
 
-fn quantiles_us(times_ns: impl Iterator<Item = u64>) -> anyhow::Result<[f64; 3]> {
-    let mut histogram = Histogram::<u64>::new(3)?;
-    times_ns.for_each(|time| histogram.saturating_record(time));
-    Ok([0.5, 0.99, 1.0].map(|quantile| histogram.value_at_quantile(quantile) as f64 / 1e3))
-}
-
-/// Of each tick, how much longer than in Rust, from the least to the most.
-fn overheads_us(times: &Through, rust: &Through) -> [f64; 2] {
-    let pairs = times.times_ns.iter().zip(&rust.times_ns);
-    let mut more: Vec<i64> = pairs.map(|(time, rust)| *time as i64 - *rust as i64).collect();
-    more.sort_unstable();
-    [50, 99].map(|percent| more[(more.len() - 1) * percent / 100] as f64 / 1e3)
+/// p50, p99 and the most of them.
+fn quantiles_us(times_ns: impl Iterator<Item = i64>) -> [f64; 3] {
+    let mut sorted: Vec<i64> = times_ns.collect();
+    sorted.sort_unstable();
+    [50, 99, 100].map(|percent| sorted[(sorted.len() - 1) * percent / 100] as f64 / 1e3)
 }
 
 fn row(name: &str, found: &Through, rust: &Through, paired: bool) -> anyhow::Result<Value> {
-    let [p50, p99, most] = quantiles_us(found.times_ns.iter().copied())?;
+    let times = || found.times_ns.iter().map(|time| *time as i64);
+    let [p50, p99, most] = quantiles_us(times());
     let pairs = found.actions.iter().zip(&rust.actions);
     let same = pairs.filter(|(action, rust)| action.to_bits() == rust.to_bits()).count();
-    let overhead = paired.then(|| overheads_us(found, rust));
+    // Of each tick, how much longer than in Rust.
+    let more = times().zip(&rust.times_ns).map(|(time, rust)| time - *rust as i64);
+    let overhead = paired.then(|| quantiles_us(more));
     let shown = overhead.map_or_else(
         || "                       -".to_owned(),
-        |[p50, p99]| format!("{p50:>12.3} {p99:>11.3}"),
+        |[p50, p99, _]| format!("{p50:>12.3} {p99:>11.3}"),
     );
     outln!("{name:<24} {p50:>9.2} {p99:>9.2} {most:>9.2} {shown}   {same} of {}", rust.actions.len());
     Ok(json!({

@@ -11,6 +11,8 @@ if(NOT TARGET rcwm::rcwm)
   set_target_properties(rcwm::static PROPERTIES
     IMPORTED_LOCATION "${_rcwm_prefix}/lib/librcwm.a"
     INTERFACE_INCLUDE_DIRECTORIES "${_rcwm_prefix}/include"
+    # Pieces in assembler do not say that they need no executable stack.
+    INTERFACE_LINK_OPTIONS "LINKER:-z,noexecstack"
     INTERFACE_LINK_LIBRARIES "Threads::Threads;gcc_s;util;rt;m;${CMAKE_DL_LIBS}")
 endif()
 

@@ -15,7 +15,6 @@ pub const RCWM_VERSION_PATCH: u32 = 0;
 
 /// How a call ended. rcwm_last_error() has the words.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
-#[expect(clippy::enum_variant_names, reason = "C has one space of names")]
 #[repr(i32)]
 pub enum Code {
     RcwmOk = 0,

@@ -129,6 +129,9 @@ fn the_policy_in_c_decides_the_same_from_the_shared_and_from_the_static_library(
     assert_eq!(decided(&compile("examples/policy.c")), decided(&alone));
     let needed = succeed(Command::new("readelf").arg("-d").arg(&alone));
     assert!(!needed.contains("librcwm"), "{needed}");
+    let segments = succeed(Command::new("readelf").arg("-lW").arg(&alone));
+    let stack = segments.lines().find(|line| line.contains("GNU_STACK"));
+    assert!(stack.is_some_and(|line| !line.contains("RWE")), "{segments}");
 }
 
 #[test]
