@@ -106,7 +106,12 @@ fn in_real_time_the_simulator_never_waits_and_both_sides_agree() {
     let count = |name: &str| counters[name].as_u64().unwrap();
     // The controller may come late and miss some; what it saw and what it knows that it missed is all there was since.
     assert!(count("observations") + count("missed_observations") <= 41 + count("repeated_observations"));
-    assert_eq!(count("answers"), count("observations"));
+    // On a busy machine some ticks are imagined, or their answers overtaken.
+    assert!(
+        count("answers") <= count("observations") + count("imagined_answers") + count("fallback_answers")
+    );
+    let unanswered = count("stale_observations") + count("overtaken_answers");
+    assert!(count("answers") + unanswered >= count("observations"));
 }
 
 #[test]
