@@ -171,9 +171,7 @@ pub enum EngineError {
     /// A choice that the engine does not have.
     #[error("{what}: {instead}")]
     Choice {
-        /// What was chosen.
         what: String,
-        /// What there is.
         instead: String,
     },
     /// Somewhere inside a graph stands what is no number, whatever its outputs say.
@@ -182,7 +180,6 @@ pub enum EngineError {
     /// The bundle does not have the part.
     #[error("the bundle has no {part}")]
     NoPart {
-        /// The part.
         part: PartName,
     },
     /// A weight that no training gives.
@@ -191,39 +188,28 @@ pub enum EngineError {
          is damaged or its training has diverged: export another checkpoint"
     )]
     Weights {
-        /// The part.
         part: PartName,
-        /// The constant.
         tensor: String,
-        /// The value.
         found: String,
     },
     /// A part could not be made ready.
     #[error("engine {engine}: loading {part}: {reason}")]
     Load {
-        /// The engine.
         engine: EngineKind,
-        /// The part.
         part: PartName,
-        /// What it said.
         reason: String,
     },
     /// A part failed while running.
     #[error("engine {engine}: running {part}: {reason}")]
     Run {
-        /// The engine.
         engine: EngineKind,
-        /// The part.
         part: PartName,
-        /// What it said.
         reason: String,
     },
     /// A tensor that was handed over is not the one the part takes or gives.
     #[error("engine {engine}: {part}: {found}, expected {expected}")]
     Tensor {
-        /// The engine.
         engine: EngineKind,
-        /// The part.
         part: PartName,
         /// What was handed over.
         found: String,
