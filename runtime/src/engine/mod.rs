@@ -170,42 +170,25 @@ pub enum EngineError {
     OrtNotBuilt,
     /// A choice that the engine does not have.
     #[error("{what}: {instead}")]
-    Choice {
-        what: String,
-        instead: String,
-    },
+    Choice { what: String, instead: String },
     /// Somewhere inside a graph stands what is no number, whatever its outputs say.
     #[error("{part}: a value inside the graph is not finite")]
     NotFinite { part: PartName },
     /// The bundle does not have the part.
     #[error("the bundle has no {part}")]
-    NoPart {
-        part: PartName,
-    },
+    NoPart { part: PartName },
     /// A weight that no training gives.
     #[error(
         "{part}: weight {tensor:?} holds {found}, accepted are finite values up to 1e6, with 16-bit weights up to 65504; the bundle \
          is damaged or its training has diverged: export another checkpoint"
     )]
-    Weights {
-        part: PartName,
-        tensor: String,
-        found: String,
-    },
+    Weights { part: PartName, tensor: String, found: String },
     /// A part could not be made ready.
     #[error("engine {engine}: loading {part}: {reason}")]
-    Load {
-        engine: EngineKind,
-        part: PartName,
-        reason: String,
-    },
+    Load { engine: EngineKind, part: PartName, reason: String },
     /// A part failed while running.
     #[error("engine {engine}: running {part}: {reason}")]
-    Run {
-        engine: EngineKind,
-        part: PartName,
-        reason: String,
-    },
+    Run { engine: EngineKind, part: PartName, reason: String },
     /// A tensor that was handed over is not the one the part takes or gives.
     #[error("engine {engine}: {part}: {found}, expected {expected}")]
     Tensor {
